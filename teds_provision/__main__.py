@@ -13,22 +13,23 @@ def main() -> None:
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         print(f"teds-provision {__version__}")
         return
-    gc.disable()  # until a command runs: what imports make is kept, and looking through it again and again takes 4 ms
+    gc.disable()  # until a command runs: objects made by imports are kept, and repeated collections over them take 4 ms
     try:
-        from teds_provision.cli import main as command_line  # here, so that Ctrl-C while Python imports it is caught
+        # imported inside the try, so that Ctrl-C during the import is handled
+        from teds_provision.cli import main as command_line
         from teds_provision.cli import stdout
 
         output = stdout.guard()
         code = stdout.ended(
             command_line.run(sys.argv[1:]), output, must_print=lambda: command_line.must_print(sys.argv[1:])
         )
-        gc.freeze()  # what is left goes with the process: to search it for circles takes a tenth of a short command
+        gc.freeze()  # skips the collection at exit, which takes a tenth of a short command
         sys.exit(code)
-    except ModuleNotFoundError as error:  # click: without it there is no command line that could report it
+    except ModuleNotFoundError as error:  # click is missing, so there is no command line that could report it
         cure = f"Install it: {sys.executable} -m pip install {error.name}"
         print(f"Error: The installation is incomplete: {error.name} missing.\n  → {cure}", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:  # while Python was still importing, or already leaving
+    except KeyboardInterrupt:  # during the imports, or at exit
         sys.exit(130)
 
 

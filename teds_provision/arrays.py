@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Octets = bytes | bytearray | memoryview | NDArray[np.uint8]
 else:
     np = late("numpy")
-    NDArray = Floats = Ends = Octets = object  # for annotations alone, which nothing evaluates
+    NDArray = Floats = Ends = Octets = object  # used only in annotations, which are never evaluated
 
 
 def without_repeats(values: Floats) -> Floats:

@@ -128,7 +128,7 @@ class Client:
         self._connection: http.client.HTTPConnection | None = None
         self.etag: str | None = None
         """ETag of the last answer, None if it had none."""
-        self._read: dict[str, str] = {}  # the ETag of the datasheet that was read last of each node
+        self._read: dict[str, str] = {}  # the ETag of the last datasheet read, per node
 
     def __enter__(self) -> Client:
         return self
@@ -171,7 +171,8 @@ class Client:
             headers["If-Match"] = if_match
         if self._token:
             headers["Authorization"] = f"Bearer {self._token}"
-        again = self._connection is not None and method == "GET"  # kept open; the daemon may have closed it meanwhile
+        # the daemon may have closed the kept connection meanwhile
+        again = self._connection is not None and method == "GET"
         try:
             return self._exchange(method, path, body, headers)
         except (OSError, http.client.HTTPException) as error:
@@ -189,7 +190,7 @@ class Client:
             self.close()
         if self._connection is None:
             self._connection = self._open()
-        with suppress(BrokenPipeError, ConnectionResetError):  # it may answer before it has read all of a body
+        with suppress(BrokenPipeError, ConnectionResetError):  # the daemon may reply before it has read the whole body
             self._connection.request(method, API + path, body, headers)
         answer = self._connection.getresponse()
         self.etag = answer.getheader("ETag")

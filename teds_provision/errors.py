@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final
 
 _CODES: Final = {
     1: "failed bug incomplete-installation",
-    2: "usage unclear-item bad-request",  # bad-request is of the API alone
+    2: "usage unclear-item bad-request",  # bad-request is used only by the API
     3: "not-found",
     4: "not-authentic fork",
     5: "link no-reader no-node node-silent garbled address-conflict registry lost unproven no-answer",

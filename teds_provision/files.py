@@ -35,7 +35,7 @@ from teds_provision.portable import (
 
 if TYPE_CHECKING:
     import socket
-else:  # most commands listen on nothing
+else:  # most commands do not listen
     socket = late("socket")
 
 PRIVATE: Final = 0o600
@@ -43,7 +43,7 @@ PRIVATE: Final = 0o600
 SHARED: Final = 0o666
 """Mode of results that are no secret; the user's umask takes away from it."""
 _SUFFIX: Final = ".teds-part"
-_STALE_SECONDS: Final = 60.0  # between making the file and locking it a living writer looks like a dead one
+_STALE_SECONDS: Final = 60.0  # a file that was just created is not locked yet, and looks as if its writer had died
 _LONGEST_SOCKET: Final = 100
 """Octets: Linux takes 107 for the name of a Unix socket."""
 _PIECE: Final = 1 << 16
@@ -68,19 +68,21 @@ def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[t
     """Open a draft as :func:`whole_file` does, and yield its present path too, for callers that write by name."""
     if not path.name:  # "" and "/"
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if replace and path.exists() and not (path.is_file() or path.is_dir()):  # a rename would end a device: /dev/null
+    # a rename would replace the device: /dev/null
+    if replace and path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError(errno.EINVAL, "it is a device, pipe or socket and cannot be replaced by a file", str(path))
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
     _sweep(path)
     descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | NOFOLLOW | CLOSING, mode)
     try:
         with open(descriptor, "w+b") as file:
-            with suppress(OSError):  # some network folders have no locks: then only its age identifies a left-over file
+            # some network folders have no locks; there only its age identifies a left-over file
+            with suppress(OSError):
                 lock(file.fileno())
             yield draft, file
             file.flush()
             os.fsync(file.fileno())
-            if RENAMES_OPEN_FILES:  # still locked: no other process takes the draft for a left-over
+            if RENAMES_OPEN_FILES:  # while it is locked, no other process treats the draft as a left-over
                 _publish(draft, path, replace=replace)
         if not RENAMES_OPEN_FILES:
             _publish(draft, path, replace=replace)
@@ -235,16 +237,16 @@ def _unreadable(path: Path | str, error: OSError | ValueError, failure: type[Ted
         return NotFoundError(f"{path} is a folder, not a file.")
     if isinstance(error, OSError):
         return failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.")
-    return NotFoundError(f"{str(path)!r} is not a valid file name.")  # a zero octet in it
+    return NotFoundError(f"{str(path)!r} is not a valid file name.")  # the name contains a NUL octet
 
 
 def _read(descriptor: int, size: int, most: int) -> bytes:
     """Read at most ``most`` octets of an open file of ``size`` (0: not known) and close it; raises OSError."""
     parts: list[bytes] = []
-    try:  # by the system's own calls: half of the cost of open(), for thousands of files
+    try:  # system calls take half as long as open(), which counts for thousands of files
         if 0 < size < _PIECE:
             part = os.read(descriptor, min(most, size + 1))
-            if len(part) == size:  # one more was asked for, so it ends here
+            if len(part) == size:  # one octet more was requested, so this is the end of the file
                 return part
             parts.append(part)
             most -= len(part)
@@ -279,7 +281,7 @@ def _below(folder: str) -> Iterator[str]:
     with suppress(OSError), os.scandir(folder) as entries:
         here = sorted(entries, key=attrgetter("name"))
     for entry in here:
-        if entry.name.endswith(_JSON) and _is_file(entry):  # nearly all of them
+        if entry.name.endswith(_JSON) and _is_file(entry):  # nearly all entries
             yield entry.path
         elif _is_folder(entry):
             yield from _below(entry.path)
@@ -358,7 +360,7 @@ def short_path(path: Path) -> Iterator[str]:
 def listen_alone(path: Path, waiting: int) -> socket.socket:
     """Return a Unix socket that only this user can reach; that of a killed process is replaced. Raises StoreError."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
+    before = os.umask(0o177)  # the mode is set when the socket is bound, so other users can never connect
     try:
         with suppress(FileNotFoundError):
             path.unlink()
@@ -411,7 +413,7 @@ def _taken(path: Path) -> UsageError:
 
 
 def _cannot_write(path: Path, error: OSError, failure: type[TedsProvisionError]) -> TedsProvisionError:
-    if failure is StoreError and isinstance(error, FileNotFoundError | NotADirectoryError):  # of a name from a user
+    if failure is StoreError and isinstance(error, FileNotFoundError | NotADirectoryError):  # the user gave this path
         return NotFoundError(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
     if isinstance(error, IsADirectoryError):
         return UsageError(f"{path} is a folder, not a file.", hint="Name a file in it.")

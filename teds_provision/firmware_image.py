@@ -116,7 +116,8 @@ def read_firmware_image(octets: bytes, key: KeyClass | None = None) -> FirmwareI
     Raises BadDataError, NotAuthenticError.
     """
     image, dumpinfo = _imgtool("image"), _imgtool("dumpinfo")
-    dumpinfo.print = _no_output  # it warns of a bad trailer on stdout, which is ours, and silent does not prevent that
+    # it prints a warning about bad trailers to stdout, and its option silent does not prevent this
+    dumpinfo.print = _no_output
     with tempfile.TemporaryDirectory() as folder:
         path, listing = Path(folder, "image.bin"), Path(folder, "image.json")
         path.write_bytes(octets)
@@ -186,7 +187,7 @@ def _imgtool(module: str) -> Any:
     try:
         return import_module(f"imgtool.{module}")
     except ModuleNotFoundError as error:
-        first: BaseException = error  # imgtool is there, and what it needs is not: cbor2, then cbor in its place
+        first: BaseException = error  # imgtool is installed but cbor2, and its replacement cbor, are missing
         while isinstance(first.__context__, ModuleNotFoundError):
             first = first.__context__
         missing = (getattr(first, "name", None) or "imgtool").partition(".")[0]

@@ -45,7 +45,7 @@ def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], o
             if not name.startswith("_"):
                 return import_module(module)
         except ModuleNotFoundError as error:
-            if error.name != module:  # it is there, and something that it needs is not
+            if error.name != module:  # the module exists, and one of its imports is missing
                 raise
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
@@ -118,7 +118,7 @@ def is_installed(module: str) -> bool:
     """Return True if a module can be found; does not import it."""
     try:
         return util.find_spec(module) is not None
-    except (ModuleNotFoundError, ValueError):  # what contains it is missing, or it was taken out of sys.modules
+    except (ModuleNotFoundError, ValueError):  # its package is missing, or it was removed from sys.modules
         return False
 
 

@@ -21,7 +21,7 @@ from teds_provision.lazy import late
 if TYPE_CHECKING:
     import tomllib
 else:
-    tomllib = late("tomllib")  # most files are JSON
+    tomllib = late("tomllib")  # most files are JSON and do not need it
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Limits:
 
 LIMITS: Final = Limits()
 
-# Possessive quantifiers and a border in front keep these linear in the text, whatever it holds.
+# Possessive quantifiers and the lookbehind keep the search linear for any input.
 _PART: Final = r"(?:[A-Za-z0-9_-]++|'')"
 _LONG_KEY: Final = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{LIMITS.toml_parts}}}")
 _LONG_INTEGER: Final = re.compile(rf"(?<![A-Za-z0-9_-])[+-]?(?:0[xob])?[0-9a-fA-F_]{{{LIMITS.integer_digits + 1}}}")
@@ -103,7 +103,7 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
         raise BadDataError(f"{_upper(what)} is not text: it is binary, or not UTF-8.") from error
     except ValueError as error:
         raise BadDataError(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
-    if opened > LIMITS.json_depth:  # fewer brackets than levels nest no deeper
+    if opened > LIMITS.json_depth:  # with no more brackets than permitted levels, nesting cannot be too deep
         check_depth(value, LIMITS.json_depth, what)
     return value
 
@@ -144,7 +144,7 @@ def load_toml(text: str, file: str) -> dict[str, Any]:
     check_toml(text, file)
     try:
         data = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # a ValueError that is no TOMLDecodeError: an integer of 4,301 digits
+    except (ValueError, RecursionError) as error:  # a plain ValueError: an integer of more than 4,300 digits
         raise BadDataError(f"{file} is not valid TOML: {error}.") from error
     check_depth(data, LIMITS.toml_depth, file)
     return data
@@ -171,7 +171,7 @@ def whole_number(text: str, what: str) -> int:
 def _parsed(text: str | bytes) -> Any:
     """Parse as ``json.loads`` does, but with one decoder: json.loads would make another for every document."""
     if isinstance(text, str) and text.startswith("\ufeff"):
-        return json.loads(text)  # it says what is wrong there
+        return json.loads(text)  # json.loads raises the error with its position
     return _decoder().decode(
         text if isinstance(text, str) else text.decode(json.detect_encoding(text), "surrogatepass")
     )

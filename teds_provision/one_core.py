@@ -213,12 +213,13 @@ class OneCore:
                         self._kernel.place(0, self._placed)
 
     def _run(self) -> None:
-        pause, apart = FIRST_LOOK, 1 + os.getpid() % 8 / 16  # two stations do not leave a core at the same moment
+        # stations with different process ids do not move at the same moment
+        pause, apart = FIRST_LOOK, 1 + os.getpid() % 8 / 16
         while not self._end.wait(pause):
             pause = LOOK_SECONDS * apart
             try:
                 self.look()
-            except (OSError, ValueError, KeyError):  # a core was taken out
+            except (OSError, ValueError, KeyError):  # a core was taken offline
                 self.leave()
             if self._left:
                 return

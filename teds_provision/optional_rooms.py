@@ -65,7 +65,7 @@ def rooms() -> Mapping[str, OptionalRoom]:
         try:
             found[name] = import_module(f"{package}.room").ROOM
         except ModuleNotFoundError as error:
-            if error.name not in (package, f"{package}.room"):  # the room is there, and something that it needs is not
+            if error.name not in (package, f"{package}.room"):  # the room exists, and one of its imports is missing
                 raise
     return found
 

@@ -531,7 +531,7 @@ class Entry(TypedDict):
     failed: bool
 
 
-# -- what holds a list of them, or one thing ---------------------------------------------------------------------------
+# -- answers that hold one or several of the above ---------------------------------------------------------------------
 
 
 class DetectionMode(TypedDict):

@@ -49,10 +49,10 @@ class Operation:
     body: type[Any] | None = None
     status: int = 200
     query: dict[str, Schema] = field(default_factory=dict)
-    document: bool = False  # whether it may answer a document that is no JSON
+    document: bool = False  # True if the answer may be a document that is not JSON
     header: dict[str, Schema] = field(default_factory=dict)  # optional headers of the request
-    tag: str = ""  # the condition under which the answer has an ETag, "" for never
-    octets: int = 0  # of the body at most, if it is a file as it is and no JSON
+    tag: str = ""  # when the answer has an ETag; "" for never
+    octets: int = 0  # longest body, if it is a file and not JSON
 
 
 def _integer(least: int, most: int) -> Schema:
@@ -218,7 +218,7 @@ def _operation(operation: Operation, named: dict[str, Schema]) -> dict[str, Any]
             "ETag": {"description": f"Names the datasheet that the node has ({operation.tag}).", "schema": _TEXT}
         }
     if operation.status == 202:
-        responses["200"] = responses["202"]  # a waiting that was cancelled, a plan
+        responses["200"] = responses["202"]  # 200 for a cancelled wait or a plan
     responses |= {key: {"$ref": f"#/components/responses/{key}"} for key in REFUSALS}
     words = "".join(part.strip("{}").title().replace("-", "") for part in operation.path.split("/"))
     found: dict[str, Any] = {

@@ -61,7 +61,7 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
     if is_typeddict(shape):
         name = shape.__name__.removesuffix("Members")
         if name not in named:
-            named[name] = {}  # here already, should it hold itself
+            named[name] = {}  # registered first, in case the type refers to itself
             hints = get_type_hints(shape, include_extras=True)
             named[name] = {
                 "type": "object",

@@ -113,7 +113,7 @@ def _note(station: Station, notice: Callable[[str], object] | None, **detail: ob
             station.audit("backup", None, "done", **detail)
     except StoreLockedError:
         raise
-    except StoreError as failure:  # a full or read-only disk is a reason for a backup, and must not make it fail
+    except StoreError as failure:  # a full or read-only disk is a reason to make a backup, so it must not prevent one
         return [f"The audit log has no entry of this backup: {failure.message}"]
     return []
 

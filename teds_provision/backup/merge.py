@@ -60,7 +60,7 @@ class Merge:
             if known is None or (self.newer and known != handover):
                 self.live.handovers.put(handover)
                 self.back["handovers"] += 1
-        if not self.older:  # what an older copy has and this store lacks was undone, or rotated away, since
+        if not self.older:  # if the backup is older, a row missing from this store was undone or rotated away since
             for tombstone in self.copy.policy.tombstones():
                 if self.live.policy.tombstone(tombstone.uuid) is None:
                     self.live.policy.put_tombstone(tombstone)
@@ -136,7 +136,8 @@ class Merge:
             if record.uuid in self.barred:
                 self.kept["keys of revoked or moved nodes left out"] += 1
             elif newest is None or record.epoch > newest:
-                # Beside a key that is held it comes as pending: an Open under it decides, and drops the other.
+                # If this store already holds a key of the node, add this one as pending; the next Open shows which key
+                # is in use.
                 self.live.keys.add(
                     replace(record, state="pending", source="import") if record.uuid in self.held else record
                 )

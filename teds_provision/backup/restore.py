@@ -102,7 +102,8 @@ def rebuild(
 
     def make(known: Ask) -> RestoreResult:
         with StoreLock(home, command="restore"):
-            if (present := open_present(home, content)) is not None:  # the operator was asked about a home without one
+            # the operator confirmed a restore into an empty home
+            if (present := open_present(home, content)) is not None:
                 present.close()
                 raise VaultChangedError(
                     f"Another command has created the station in {home} in the meantime; this one changed nothing.",
@@ -111,12 +112,12 @@ def rebuild(
             vault, why = bring_vault(home, content, known, wanted, costs)
             kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
             with copy.transaction():
-                # note in a restored store of this machine's keystore
+                # The restored store names the keystore of this machine.
                 facts = copy.identity.record()
                 if facts is not None:
                     copy.identity.put(replace(facts, keystore=kind, keystore_why=why))
                 due = _demand_rotations(copy, content)
-                # Have a home that belongs to a plant look for its own pages before it states anything there
+                # A station of a plant must fetch its own pages before it signs new ones.
                 in_plant = copy.plant.record() is not None
                 if in_plant:
                     copy.adopt(vault)
@@ -147,7 +148,7 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
     The path of a module never comes from a backup: for keys in a token the URI has to be given (UsageError). Raises
     PolicyError if the keys cannot be stored there.
     """
-    # The backup's own keystore if any machine can have it; None for this machine's default.
+    # Keep the backup's keystore if it works on any machine; None for this machine's default.
     kept = None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
     wanted = asked or kept
     into_token = wanted is not None and wanted.startswith("pkcs11:")

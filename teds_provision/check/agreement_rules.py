@@ -161,7 +161,7 @@ def _slip_of_request(probe: Probe) -> slips.Slip | None:
         return probe.plain(request(strange.request(message=message))).ok
 
     if takes(b"") or takes(b"no station key"):
-        return None  # it refuses the right one no more, or takes any: no slip explains that
+        return None  # it refuses a good SIG104 now, or accepts any: no slip explains either
     return next((slip for slip, message in slips.station_keys(strange.station.point) if takes(message)), None)
 
 
@@ -390,7 +390,7 @@ def confirm_newest(probe: Probe) -> str:
     """Check that a new good Request replaces the pending agreement: the tagS of the former gets 12."""
     tapped_or_bus(probe)
     first, _ = agree(probe)
-    if probe.keep is not None:  # a node that takes it shall not be lost
+    if probe.keep is not None:  # keep the key, in case the node adopts it: otherwise the node would be lost
         probe.keep(first)
     stranger_asks(probe)
     return demand(probe.plain(first.confirm), Reason.BAD_TAG, "Confirm (128.2) of the Request before the last")
@@ -402,7 +402,7 @@ def confirm_whole_tag(probe: Probe) -> str:
     tapped_or_bus(probe)
     for at in (0, 15):
         agreed, tried = agree(probe)
-        if probe.keep is not None:  # a node that takes it shall not be lost
+        if probe.keep is not None:  # keep the key, in case the node adopts it: otherwise the node would be lost
             probe.keep(agreed)
         right = agreed.confirm.payload
         wrong = right[:at] + bytes([right[at] ^ 1]) + right[at + 1 :]
@@ -477,7 +477,7 @@ def keyed_untapped(probe: Probe) -> str:
     """Check that untapped Request, Confirm and Set CAN address get 3 once the node has a key."""
     if probe.tapped:
         raise NotApplicableError(f"Every command counts as tapped on this link. {OVER_CAN}")
-    # what is refused here would change nothing even where it is let through: its SIG104, length and state are wrong
+    # These change nothing even if a faulty node runs them: their SIG104, length and state are wrong.
     probe.refused(request(StrangerStation.make().request(certified=False)), Reason.NOT_PERMITTED)
     probe.refused(security_command(Function.CONFIRM, bytes(16)), Reason.NOT_PERMITTED)
     return probe.refused(security_command(Function.SET_CAN_ADDRESS, b"\0"), Reason.NOT_PERMITTED)
@@ -559,7 +559,7 @@ def confirm_ends_sessions(probe: Probe) -> str:
         others = [probe.from_station(1), probe.from_station(2)]
         others[0].open()
         others[0].sealed_good(IDENTIFY)
-        others[1].open()  # half-open: nothing is sealed in it
+        others[1].open()  # half-open: no Sealed frame is sent
     before, stored = probe.identity(), _teds_of(probe)
     confirm(probe, sealed=True)
     probe.session, probe.before_rotation = None, (before, stored)

@@ -204,7 +204,7 @@ def can_functional(probe: Probe) -> str:
         frame = stranger.next(_QUIET)
         if frame is not None:
             stranger.end()
-            while stranger.next(_QUIET) is not None:  # the replies to the others
+            while stranger.next(_QUIET) is not None:  # the replies to the other commands
                 stranger.end()
             number = (frame.octets[1] if frame.octets[0] >> 4 == 0 else frame.octets[2]) - 1
             command = asked[number] if number < len(asked) else asked[0]
@@ -333,7 +333,7 @@ def can_announce(probe: Probe) -> str:
         probe.session = None
         raise RuleBrokenError(f"{what}: the node moved to {address}. Its CRC {own:08x} is smaller, so it stays.")
     right = Announce(home, state, own).encode()
-    same = frame.octets[:6] == right[:6] and len(frame.octets) == len(right)  # behind the CRC stands no claim
+    same = frame.octets[:6] == right[:6] and len(frame.octets) == len(right)  # octets after the CRC are optional
     holds(same, f"{what}: it announces {frame.octets.hex()}; {right.hex()} is due.")
     return f"announces CRC {own:08x}, {state.name.lower()}"
 

@@ -102,7 +102,7 @@ def can_busy(probe: Probe) -> str:
     came = second.hex() or "nothing"
     due = "a flow control, or a single frame with refusal 17, is due"
     holds(fine, f"A second station's first frame beside another's long request: {came} came; {due}.")
-    probe.pause(_GIVEN_UP)  # N_Cr: the node gives both up
+    probe.pause(_GIVEN_UP)  # past N_Cr, the node drops both unfinished messages
     return probe.refused(_LONG, Reason.NOT_PERMITTED, "a long request after it") + (
         "; 17 for the second" if refused is not None else "; both taken up"
     )

@@ -125,7 +125,7 @@ def _fits(probe: Probe, channel: int, kind: ChannelKind, digest: bytes) -> bool:
     """Ask with a lease of 0, which is looked at after the TEDS and before any claim: 6 if it does not fit, else 19."""
     acting = kind is ChannelKind.ACTUATOR
     reply = probe.sealed(OperateCommand(channel, digest, 0, 0 if acting else None).command())
-    if reply.ok:  # rule operate-lease says so
+    if reply.ok:  # the rule operate-lease reports this
         probe.sealed_good(idle())
     return reply.reason != Reason.DIGEST_MISMATCH
 
@@ -374,7 +374,7 @@ def _messages(
         if address is None or address.node != probe.contact.address or address.stream != asked.stream:
             continue
         message = assembly.add_segment(address.segment, heard.octets) if address.station == frames.own else None
-        if message is not None and (stale is None or stale.open(message) is None):  # else of the run before
+        if message is not None and (stale is None or stale.open(message) is None):  # skips messages of the run before
             came.append(message)
     return came
 
@@ -404,7 +404,7 @@ def stream_messages(probe: Probe) -> str:
             )
             holds(len(came) == _MESSAGES, text)
             last = -1
-            for message in came:  # a message that could not leave in time is dropped, its counter too
+            for message in came:  # a dropped message uses up its counter, so gaps are allowed
                 counter = int.from_bytes(message[:4], "big")
                 text = (
                     f"Subscribe (128.14), run {run}: a data message with counter {counter} came after one with {last}."
@@ -416,7 +416,7 @@ def stream_messages(probe: Probe) -> str:
         rest = _messages(probe, frames, asked, subscribed.length, _MOST_LATE, 3 * asked.period / 1e9)
         late = [
             message for message in rest if int.from_bytes(message[:4], "big") >= stopped
-        ]  # others were on their way
+        ]  # lower counters left before the Stop
         holds(not late, f"Stop (128.15): a data message left after its reply; counter {stopped} was the next.")
     return f"{_MESSAGES} messages each of runs 1 and 2, at a period of {asked.period // 10**6} ms"
 

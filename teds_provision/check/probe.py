@@ -180,7 +180,7 @@ class Probe:
                 raise RuleBrokenError(f"{what}: {error.message}") from None
             if len(raw) > self.max_message:
                 raise RuleBrokenError(f"{what}: {len(raw)} octets came; maxMessage is {self.max_message}.")
-            if inside is None or not reply.ok:  # what is sealed is told when it is opened
+            if inside is None or not reply.ok:  # sealed replies are recorded after they are opened
                 self.contact.note("in", raw, f"reply to {what}: {describe_reply(reply)}")
             if reply.reason != Reason.BUSY:
                 return reply
@@ -306,7 +306,7 @@ class Probe:
         session = StationSession(key, self.uuid, one_time=one_time)
         command = session.open(self.opening_counter())
         reply = self.plain(command)
-        if reply.reason == Reason.BAD_TAG:  # another station may have been faster
+        if reply.reason == Reason.BAD_TAG:  # another station may have used up the counter
             command = session.open(self.opening_counter())
             reply = self.plain(command)
         if not reply.ok:
@@ -336,7 +336,7 @@ class Probe:
         def takes(payload: Callable[[bytes], bytes]) -> bool:
             return self.plain(security_command(Function.OPEN, payload(self.opening_counter()))).ok
 
-        # what it refuses no more, or takes whatever it is, no slip explains
+        # If the node accepts a correct Open, or a mac of zeros, no slip explains its refusal.
         if takes(lambda counter: key_id(key) + point + open_mac(key, self.uuid, counter, point)):
             return None
         if takes(lambda _: (bytes(8) if about_key else key_id(key)) + point + bytes(TAG_OCTETS)):
@@ -383,7 +383,7 @@ class Probe:
 
         right = session.seal(IDENTIFY, counter=_FAR_COUNTER).payload
         if takes(right) or takes(right[:4] + bytes(len(right) - 4)):
-            return None  # it refuses it no more, or takes whatever comes: no slip explains that
+            return None  # it accepts a correct frame now, or any frame: no slip explains either
         tries = enumerate(slips.SEALED, _FAR_COUNTER + 1)
         frame = IDENTIFY.encode()
         return next((slip for counter, (slip, seal) in tries if takes(seal(session.keys, counter, frame))), None)
@@ -407,7 +407,7 @@ class Probe:
             self.plain(self.session.seal(security_command(Function.CLOSE)))
             self.session = None
 
-    # -- what the node says ----------------------------------------------------------------------------------------
+    # -- facts about the node --------------------------------------------------------------------------------------
 
     @property
     def noisy(self) -> bool:

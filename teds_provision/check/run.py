@@ -114,7 +114,7 @@ class _Run:
     def all(self) -> CheckReport:
         try:
             ours = self._probe.identity().state != NodeState.FACTORY
-        except RuleBrokenError:  # the rules say what is wrong with it
+        except RuleBrokenError:  # the rules report what is wrong with the reply
             ours = self._node.identity.state != NodeState.FACTORY
         if ours:
             self._take_up()
@@ -128,7 +128,7 @@ class _Run:
             if ours:
                 self._stage(Stage.KEYED)
                 self._stage(Stage.SESSION)
-                if not self._factory:  # else when it is a factory node again, whose TEDS may be written
+                if not self._factory:  # TEDS may be written only in factory state; then these rules run later
                     self._stage(Stage.MEASURING)
             self._in_factory_state(ours)
         except LinkError as lost:
@@ -179,10 +179,11 @@ class _Run:
         for left in reversed(range(_TORN_TRIES)):
             try:
                 return self._tried(rule)
-            except GarbledError as torn:  # of the link, after its own repetitions
+            except GarbledError as torn:  # from the link, after its own repetitions
                 why, self._probe.session = torn.message, None
                 if left:
-                    self._probe.listen()  # a node that answers nothing else either is lost, not wrong in this
+                    # raises LinkError if the node answers nothing: then it is lost, and this rule did not fail
+                    self._probe.listen()
         also = " Identify was answered meanwhile: it is the node, or a very bad bus." if self._probe.noisy else ""
         text = f"{self._probe.asked}: no reply that can be read, {_TORN_TRIES} times.{also} {why}"
         return RuleResult(rule.name, rule.clause, "failed", text)
@@ -263,7 +264,7 @@ class _Run:
             self._stage(Stage.SESSION)
         self._stage(Stage.COMMIT)
         self._stage(Stage.MEASURING)
-        with suppress(RuleBrokenError, NotApplicableError):  # what is broken, a rule has said
+        with suppress(RuleBrokenError, NotApplicableError):  # a rule has already reported the fault
             measuring_rules.restore(probe)
         self._stage(Stage.ROTATION)
         self._stage(Stage.RESET)

@@ -124,7 +124,7 @@ def open_point(probe: Probe) -> str:
     """Check that a good mac over a point off the curve, or over a static key, gets 15 and uses c up."""
     _opens(probe)
     points = {"Es off the curve": b"\x04" + bytes(64), "Es the node's own point": probe.node_key}
-    if probe.okm and probe.credentials is not None:  # else another station may have agreed on the key
+    if probe.okm and probe.credentials is not None:  # if another station agreed on the key, its point is unknown here
         points["Es equal to P(station)"] = probe.credentials.key.point
     for why, point in points.items():
         before = probe.opening_counter()
@@ -387,7 +387,7 @@ def address_moves(probe: Probe) -> str:
     session = _moved(probe, home, target)
     now = probe.identity().can_address
     holds(now == target, f"After Set CAN address {target} Identify says {now}.")
-    if isinstance(probe.contact.link, MultiStationLink):  # another pair of addresses is another link
+    if isinstance(probe.contact.link, MultiStationLink):  # with another address pair, this is another link
         came = probe.plain(session.seal(IDENTIFY))
         probe.session = None
         demand(came, Reason.WRONG_STATE, "Sealed (128.4) in the session of the old address, sent to the new one")
@@ -418,7 +418,7 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
     session = probe.session or probe.open()
     try:
         reply = probe.sealed(_set_address(target))
-        if reply.reason == Reason.BUSY:  # somebody set it a moment before this run
+        if reply.reason == Reason.BUSY:  # another station set the address just before this run
             probe.pause(_ADDRESS_SECONDS)
             reply = probe.sealed(_set_address(target))
     except (RuleBrokenError, LinkError):

@@ -144,7 +144,7 @@ class Agreement:
         def with_digest(octets: bytes) -> bytes:
             return over(label, request, nonce, epoch, rest, hashlib.sha256(octets).digest())
 
-        # channel 0, class 128, function 1: what a command frame has before the payload of Request
+        # The header of the command frame that carries Request: channel 0, class 128, function 1.
         header = b"\0\0\x80\x01" + len(request).to_bytes(2, "big")
         return _ways(
             over(label, request, nonce, epoch, rest, digest),
@@ -276,7 +276,8 @@ class Agreement:
 
     def slip_of_tag(self) -> Slip | None:
         """Return the slip, or the pair of slips, that explains a wrong tagN; None if none does."""
-        # Of about 70,000 ways together 2,000 have two slips at most: 0.1 s instead of seconds.
+        # Only 2,000 of about 70,000 combinations have at most two slips; skipping the others takes 0.1 s instead of
+        # seconds.
         for most in (1, 2):
             for (candidate, script), (two, shared) in product(self.transcripts(), self.secrets()):
                 if _count(candidate, two) > most:

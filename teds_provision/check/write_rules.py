@@ -260,7 +260,8 @@ def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
     try:
         seen = probe.sealed_refused(update_teds(*SECURITY), reason, why)
     except RuleBrokenError:
-        if probe.teds(SECURITY) == octets:  # it took what is wrong: a good one in its place, so that the rest can go on
+        # the node accepted a wrong TEDS: write a good one, so that the other rules can run
+        if probe.teds(SECURITY) == octets:
             _write(probe, SECURITY, _signed(probe, _sheet(probe, stored_blocks(probe))))
             probe.sealed(update_teds(*SECURITY))
             probe.close()
@@ -371,7 +372,7 @@ def _signed_block(probe: Probe, block: bytes, message: bytes = b"") -> bytes:
 def _place(block: bytes, field: int) -> int:
     """Return the offset of a field's value in a data block."""
     at = 0
-    while block[at] != field or at == 0:  # the TEDSID is first by position, whatever its type
+    while block[at] != field or at == 0:  # the first tuple is always the TEDSID, whatever its type
         at += 2 + block[at + 1]
     return at + 2
 
@@ -518,7 +519,7 @@ def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, byte
         block = _sheet(probe, blocks).block()
         tries = [(slip, _signed_block(probe, block, message)) for slip, message in slips.datasheets(probe.uuid, block)]
         nonsense = _signed_block(probe, block, b"no datasheet")
-    if reason == Reason.DIGEST_MISMATCH and blocks:  # without a block every slip below gives the right datasheet
+    if reason == Reason.DIGEST_MISMATCH and blocks:  # with no blocks, all slips below give the correct datasheet
         cuts = {
             "digest-of-data-block": (slice(4, -2), "the digests of field 108 are over data blocks only"),
             "digest-without-length": (slice(4, None), "the digests of field 108 leave out Length"),

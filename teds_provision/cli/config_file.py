@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from teds_provision import files, limits
 else:
-    difflib, files, limits = late("difflib"), late("teds_provision.files"), late("teds_provision.limits")  # its path
+    # loaded only if there is a config.toml
+    difflib, files, limits = late("difflib"), late("teds_provision.files"), late("teds_provision.limits")
 
 NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
 BROKERS: Final = "ncap brokers"
@@ -68,7 +69,7 @@ class Defaults(dict[str, Any]):
             if listed and not repeats and name in own:
                 raise BadDataError(f"config.toml: {path} takes one --{name}, and {len(value)} are named.", hint=_MEND)
             if listed and not repeats:
-                continue  # several buses are for the commands that work with several
+                continue  # a default of several buses applies only to commands that take several
             found[parameter_of(path, name)] = [value] if repeats and not listed else value
         return found
 
@@ -105,9 +106,9 @@ def _anchored_value(name: str, value: Any, folder: Path, above: str) -> Any:
         return re.sub(rf"([?&](?:{'|'.join(_BROKER_FILES)})=)([^&#]+)", lambda m: m[1] + _from(folder, m[2]), value)
     if (
         plain in FILES
-        or (plain == "profile" and ("/" in value or value.endswith(".toml")))  # else a name
+        or (plain == "profile" and ("/" in value or value.endswith(".toml")))  # otherwise a profile's name
         or (plain == "to" and above == "backup")
-        or (plain == "to" and above == "measure" and not re.match(r"[a-z0-9]+:", value))  # else a service
+        or (plain == "to" and above == "measure" and not re.match(r"[a-z0-9]+:", value))  # otherwise a service
     ):
         return _from(folder, value)
     return value
@@ -133,7 +134,7 @@ def config_path(home: Path | None) -> Path:
 
 def read_config_text(path: Path) -> str | None:
     """Return the text of the file, None if there is none; raises BadDataError."""
-    if not os.path.lexists(path):  # or an invalid home: opening it raises the error
+    if not os.path.lexists(path):  # not exists(): if the home is invalid, opening the file raises the error
         return None
     try:
         return files.read_text(path, limits.LIMITS.text_file, "config.toml", failure=BadDataError)

@@ -41,14 +41,14 @@ if TYPE_CHECKING:
     from teds_provision.teds.certificate import ChooseItem
     from teds_provision.vault import hardening
 else:
-    # --help and usage errors open no station.
+    # Not needed for --help and usage errors, which open no station.
     fingerprints, labels = late("teds_provision.protocol.fingerprints"), late("teds_provision.station.label")
     stations, hardening = late("teds_provision.station.station"), late("teds_provision.vault.hardening")
-    client = late("teds_provision.client")  # HTTP: only if a base station runs
+    client = late("teds_provision.client")  # HTTP: only if a base station is running
     json = late("json")
-    console = late("teds_provision.cli.console")  # rich
+    console = late("teds_provision.cli.console")  # imports rich
     problem = late("teds_provision.shapes.problem")  # the form of an error as JSON
-    Console = RenderableType = Station = object  # for annotations alone, which nothing evaluates
+    Console = RenderableType = Station = object  # used only in annotations, which are never evaluated
 
 __all__ = ["App", "Console", "RenderableType", "Station", "pass_app"]
 
@@ -87,7 +87,7 @@ class App:
             _log_to_stderr(logging_level=10 if debug or verbose > 1 else 20, libraries=debug)
         App.current = self
 
-    # -- telling ---------------------------------------------------------------------------------------------------
+    # -- output ----------------------------------------------------------------------------------------------------
 
     def emit(self, result: dict[str, Any], human: Callable[[Console], None] | RenderableType | None = None) -> None:
         """Print a command's result: one JSON object on one line with --json, else ``human`` on stdout.
@@ -114,7 +114,8 @@ class App:
             yield
         except BrokenPipeError:
             raise
-        except OSError as error:  # the work is done and safe; a script that gets no answer must hear of it
+        # the work is done and stored; with --json the caller must learn that the result was not printed
+        except OSError as error:
             discard_output(sys.stdout)
             text = f"Cannot write the result to stdout: {error.strerror}."
             if self.json:
@@ -122,7 +123,7 @@ class App:
             self.note(text)
 
     def _print(self, human: Callable[[Console], None] | RenderableType) -> None:
-        if isinstance(human, str) and not sys.stdout.isatty():  # nothing that rich would be loaded for
+        if isinstance(human, str) and not sys.stdout.isatty():  # plain text needs no rich
             print(sanitize(human))
             return
         console = self.console()
@@ -180,7 +181,7 @@ class App:
             lines = f"Error{at}: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
             print_message(lines)
 
-    # -- asking ----------------------------------------------------------------------------------------------------
+    # -- prompts ---------------------------------------------------------------------------------------------------
 
     @property
     def interactive(self) -> bool:
@@ -218,7 +219,7 @@ class App:
 
     def chooses_item(self) -> ChooseItem | None:
         """Return who is asked which result of a certificate is meant: a person at a terminal."""
-        answers: dict[str, str] = {}  # the same file is read again when its board comes
+        answers: dict[str, str] = {}  # the same file is read again when its board arrives
 
         def ask(question: str, items: Sequence[tuple[str, str]]) -> str:
             if question in answers:
@@ -307,7 +308,7 @@ class App:
         try:
             with service:
                 service.status()
-        except LinkError:  # it has just ended
+        except LinkError:  # the service has just ended
             return False
         return True
 
@@ -324,7 +325,7 @@ class App:
 
 def print_message(text: str) -> None:
     """Print on stderr; foreign text in it steers no terminal, and no word is broken at its edge."""
-    with _PRINTING:  # one line at a time, whatever threads there are
+    with _PRINTING:  # threads take turns, so lines are not mixed
         sys.stderr.write(f"{folded(sanitize(text), sys.stderr)}\n")
         sys.stderr.flush()
 
@@ -375,7 +376,7 @@ def _log_to_stderr(*, logging_level: int, libraries: bool) -> None:
 pass_app = click.make_pass_decorator(App)
 
 
-# Plain lines on a terminal: broken between words, never inside one. A pipe gets them as they are.
+# Plain text on a terminal: wrapped between words, never inside one. A pipe gets it unwrapped.
 
 _NARROWEST: Final = 20
 _COMMAND: Final = ": teds-provision "

@@ -32,7 +32,8 @@ def demo(app: App, *, page: bool, http: str | None, more: str = "") -> None:
 
     Uses temporary homes and vaults, communicates on this machine only, and leaves nothing behind.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: a folder and a process are to be taken away
+    # as for Ctrl-C: the demo must remove its folder and end its process
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     if page:
         _page(app, http)
         return

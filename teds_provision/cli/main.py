@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from teds_provision.shapes import problem
 else:
     shell_completion, start = late("teds_provision.cli.shell_completion"), late("teds_provision.cli.start")
-    file_kinds = late("teds_provision.cli.file_kinds")  # for errors about a file
+    file_kinds = late("teds_provision.cli.file_kinds")  # only for errors about a file
     problem = late("teds_provision.shapes.problem")  # the form of an error as JSON
-    extending = late("teds_provision.cli.extending")  # once a command is used
+    extending = late("teds_provision.cli.extending")  # only when a command runs
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
@@ -198,13 +198,14 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
     Works over NFC, CAN and Bluetooth; then measures, publishes and drives actuators. Without a command: the station,
     who answers on its links now, what is wrong, and the next command.
     """
-    gc.freeze()  # the program itself is not looked through again
+    gc.freeze()  # objects made by imports need no more collections
     gc.enable()  # it was disabled while the program was imported
     ctx.obj = App(as_json=as_json, **options)
     if ctx.invoked_subcommand != "doctor":
         require_packages()
     broken = ctx.meta.get(_BROKEN)
-    if broken is not None and ctx.invoked_subcommand != "doctor":  # which tells it, and looks at all the rest
+    # doctor reports the broken file, and runs its other checks
+    if broken is not None and ctx.invoked_subcommand != "doctor":
         raise broken
     if ctx.invoked_subcommand is None:
         start.start(ctx.obj, ctx)
@@ -226,7 +227,7 @@ def _incomplete(*packages: str) -> IncompleteInstallationError:
 
 def _lacking(module: str) -> TedsProvisionError:
     """Return the error for a module that could not be imported: of Python itself, or of a package."""
-    if module in sys.stdlib_module_names:  # fcntl outside Unix
+    if module in sys.stdlib_module_names:  # fcntl, which only Unix has
         return TedsProvisionError(
             f"This command needs Linux: this system has no {module}.",
             hint="docs/compatibility.md lists the commands that run on other systems.",
@@ -238,7 +239,7 @@ def run(arguments: list[str]) -> int:
     """Run one command line; return the exit code. Every error is printed in at most three lines."""
     asked = os.environ.get(COMPLETE)
     if asked:
-        # Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)
+        # Answer a shell that completes a command line (``bash_source``, ``bash_complete``; zsh and fish likewise).
         from click.shell_completion import shell_complete
 
         LazyGroup.teachers.append(shell_completion.teach)
@@ -285,7 +286,7 @@ def _help_width() -> int:
 
 
 def _misused(arguments: list[str], error: click.ClickException) -> int:
-    if isinstance(error, click.exceptions.NoArgsIsHelpError):  # a group without a command: its help instead
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):  # a group without a command: print its help
         if _wants(arguments, "--json"):
             return _fail(arguments, 2, "usage", f"Missing command. (see: {error.ctx.command_path} --help)", "")
         print(error.format_message(), file=sys.stderr)
@@ -310,7 +311,7 @@ def _system_error(arguments: list[str], error: OSError) -> int:
         return _fail(arguments, NotFoundError.exit_code, NotFoundError.code, text, "")
     if error.errno not in _FULL:
         return _bug(arguments, error)
-    discard_output(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
+    discard_output(sys.stdout)  # stdout was full; errors of stores and files have their own classes
     text = f"Cannot write the result to stdout: {error.strerror}."
     return _fail(arguments, StoreError.exit_code, StoreError.code, text, "")
 
@@ -386,7 +387,7 @@ def _print_message(text: str) -> None:
         print_message(text)
 
 
-# Global options may be given before or after the command: they are moved to the front before click parses the line.
+# Global options may be given before or after the command; they are moved to the front before click parses the line.
 
 _FLAGS: Final = frozenset({"--json", "--verbose", "--quiet", "--debug", "--no-input", "-q", "-v", "-vv", "-vvv"})
 _WITH_VALUE: Final = frozenset({"--home", "--passphrase-fd"})

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from teds_provision.teds import certificate
     from teds_provision.trace import recorder
 else:
-    certificate = late("teds_provision.teds.certificate")  # the codec: only with a calibration
-    client = late("teds_provision.client")  # HTTP: only if a base station runs
+    certificate = late("teds_provision.teds.certificate")  # imports the codec: only with a calibration
+    client = late("teds_provision.client")  # HTTP: only if a base station is running
     foxglove_server = late("teds_provision.measure.sinks.foxglove_server")
-    links = late("teds_provision.links")  # for commands that reach a node
+    links = late("teds_provision.links")  # only for commands that reach a node
     recorder = late("teds_provision.trace.recorder")  # most runs have no trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -204,10 +204,11 @@ def link_options(function: Function) -> Function:
         named = can[0] if len(can) == 1 else can or None
         chosen = click.get_current_context().get_parameter_source("via") is not ParameterSource.DEFAULT
         here = options_given("nfc", "can", "ble")
-        if not chosen and (here == {"can"} or (here == {"ble"} and not nfc)):  # the one that is named is meant
+        if not chosen and (here == {"can"} or (here == {"ble"} and not nfc)):  # naming one link chooses it
             via, chosen = here.pop(), True
         with tracing(trace) as opened, readers_for(via):
-            # a setting of config.toml is the wait for a tap; the option on the command line means this very search
+            # The setting in config.toml limits the wait for a tap; --timeout on the command line also limits the search
+            # here.
             listen = timeout if options_given("timeout") else links.ports.LISTEN_SECONDS
             settings = links.LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
             return function(*args, links=settings, **rest)
@@ -334,7 +335,7 @@ def dry_run_option(function: Function) -> Function:
     return click.option("--dry-run", is_flag=True, help="Print the plan without changing anything.")(function)
 
 
-# ``--trace FILE``: the file is made before anything is waited for, and ended with the command.
+# ``--trace FILE``: the file is created before the command waits for anything, and closed with the command.
 
 
 @contextmanager
@@ -350,9 +351,9 @@ def tracing(path: Path | None) -> Iterator[links.Trace | None]:
     trace = recorder.open_trace(path, app.warn if app is not None else print)
     try:
         yield trace
-    except BaseException:  # a command that failed before the first frame can be repeated unchanged
+    except BaseException:  # if no frame was recorded the file is removed, so that the command can be repeated
         trace.close(keep_empty=False)
         raise
     trace.close()
-    if trace.failure:  # it was reported when it happened, and the result is on stdout already
+    if trace.failure:  # reported when it happened; the result is on stdout already
         raise click.exceptions.Exit(StoreError.exit_code)

@@ -57,7 +57,7 @@ def local_time(text: str) -> str:
     """Return a moment of the store (UTC) in local time with its offset; anything else unchanged."""
     try:
         return datetime.fromisoformat(text).astimezone().isoformat(sep=" ", timespec="seconds")
-    except (ValueError, OverflowError):  # a moment that a stranger wrote: the last day of 9999, east of Greenwich
+    except (ValueError, OverflowError):  # a moment from an untrusted document can be out of range in local time
         return text
 
 
@@ -198,7 +198,7 @@ class LiveReporter:
             self._show()
         else:
             self._stop()
-            if notice.kind == "node-left":  # whatever step ran ended with it
+            if notice.kind == "node-left":  # the node's step ended
                 self._step = ""
             self._console.print(sanitize(f"… {notice.text}"), style="yellow", markup=False)
 
@@ -228,14 +228,14 @@ class LiveReporter:
         what = f"  {self._what}{left}" if self._what else ""
         return Spinner(
             "dots", text=Text(sanitize(f"{self._step}{what}".lstrip()))
-        )  # a bare text would be read as markup
+        )  # rich would parse plain text as markup
 
     def close(self) -> None:
         """Take the live line away."""
         self._stop()
 
 
-# Points in time as people give them to ``--since``: ISO 8601, ``today``, or how long ago (``2h``, ``3d``).
+# Points in time as given to ``--since``: ISO 8601, ``today``, or an age (``2h``, ``3d``).
 
 _UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 

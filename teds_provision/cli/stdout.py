@@ -17,7 +17,7 @@ from typing import Any, Final
 
 BROKEN_PIPE: Final = 141
 _NOT_PRINTED: Final = 7
-# Control characters but line breaks, tabs and ESC; zero-width and direction marks; halves of surrogate pairs.
+# Control characters except line breaks, tabs and ESC; zero-width and direction marks; halves of surrogate pairs.
 _STEERING: Final = (
     "[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f"
     "\u200b-\u200f\u202a-\u202e\u2060-\u2064\u2066-\u206f\ufeff\ud800-\udfff]"
@@ -58,7 +58,7 @@ class CleanText(io.TextIOWrapper):
 
 def guard() -> GuardedOutput | None:
     """Put guarded output in the place of ``sys.stdout``; None if it is not a plain descriptor (a test's own)."""
-    for _ in range(3):  # the lowest free number is given first: 0, 1, 2, as far as they are closed
+    for _ in range(3):  # the system gives the lowest free numbers, so closed ones of 0, 1 and 2 are opened first
         descriptor = os.open(os.devnull, os.O_RDWR)
         if descriptor > 2:
             os.close(descriptor)
@@ -74,7 +74,7 @@ def guard() -> GuardedOutput | None:
     encoding = sys.stdout.encoding
     with suppress(OSError):
         sys.stdout.flush()
-    # A name in another encoding is no reason to fail after the work is done.
+    # A name that the encoding lacks must not raise an error after the work is done.
     sys.stdout = CleanText(
         io.BufferedWriter(output), encoding=encoding, errors="backslashreplace", line_buffering=output.isatty()
     )

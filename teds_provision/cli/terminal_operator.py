@@ -25,7 +25,7 @@ class TerminalOperator(Operator):
 
     def __init__(self, app: App, *, yes: bool, strangers: bool = True, several: bool = False) -> None:
         self._app, self._yes, self._strangers, self._several = app, yes, strangers, several
-        # A board comes onto the whitelist when it has its key: one that was lost before is not asked about twice.
+        # Accepted boards. A board is whitelisted once it has its key; if it is lost before that, do not ask again.
         self._accepted: set[tuple[bytes, str]] = set()
         self._turn = threading.Lock()
 

@@ -36,7 +36,7 @@ NODES: Final = (
     ("gripper", "hand", "sine:5"),
 )
 _TAPPED: Final = "temperature-sensor"
-_READY: Final = 60.0  # seconds, on a loaded machine
+_READY: Final = 60.0  # in seconds; enough for a loaded machine
 _ENDING: Final = 15.0
 
 
@@ -99,12 +99,12 @@ def _daemon(home: Path, secret: str, *options: str) -> Iterator[None]:
     os.write(write, f"{secret}\n".encode())
     os.close(write)
     command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "--passphrase-fd", str(read)]
-    with (home / "events").open("w+b") as events:  # a file: nothing reads what comes after the first line
+    with (home / "events").open("w+b") as events:  # a file and no pipe, because only the first line is read
         try:
             process = subprocess.Popen(
                 [*command, "ncap", "run", *options],
                 stdin=subprocess.DEVNULL, stdout=events, stderr=subprocess.DEVNULL, pass_fds=(read,),
-                process_group=0,  # Ctrl-C is for this process, which ends the station in order
+                process_group=0,  # Ctrl-C reaches only this process, which ends the station in order
             )  # fmt: skip
         finally:
             os.close(read)

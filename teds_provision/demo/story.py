@@ -49,7 +49,7 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.records import TrustRecord
 from teds_provision.vault.passphrase import THROWAWAY
 
-# What the demo works on: its folder, its links, the node, and the look at it from one station.
+# The context of the demo: its folder, its links, the node, and what one station knows of it.
 
 
 @dataclass
@@ -95,7 +95,7 @@ def verify_from(demo: Demo, station: Station, what: str) -> None:
         step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
 
 
-# The second half of the demo: the key goes to another station, first as a copy, then for good.
+# The second part of the demo: the key goes to another station, first as a copy, then as a move.
 
 
 def hand_over(demo: Demo, first: Station, second: Station) -> None:

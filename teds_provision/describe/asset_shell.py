@@ -27,7 +27,7 @@ _GENERAL: Final = "https://admin-shell.io/ZVEI/TechnicalData/GeneralInformation/
 _PROPERTIES: Final = "https://admin-shell.io/ZVEI/TechnicalData/TechnicalProperties/1/1"
 _SECTION: Final = "https://admin-shell.io/ZVEI/TechnicalData/MainSection/1/1"
 
-# idShort, semantic id, element of the Meta-Identification TEDS, text in a language, mandatory in the template
+# idShort, semantic id, element of the Meta-Identification TEDS, True for text with a language, True if mandatory
 _FIELDS: Final = (
     ("URIOfTheProduct", "0112/2///61987#ABN590#002", "ProductUri", False, True),
     ("ManufacturerName", "0112/2///61987#ABA565#009", "ManufacturerId", True, True),

@@ -54,7 +54,7 @@ class DescribedNode:
         file = (self.profile or "NAME") if own else "my-type.toml"
         place = f"its profile{f' {file}' if self.profile else ''}"
         hint = f"Add {key} to {place}, then: provision {self.uuid.hex()} --profile {file}"
-        if not own:  # a built-in type cannot be changed, only extended
+        if not own:  # built-in types cannot be changed, only extended
             hint = f"Make a type of your own: profile new my-type --extends {self.profile} -o {file}. {hint}"
         return MissingFieldError(
             f"{form} requires {field}, which the datasheet of node {self.uuid.hex()} lacks.", hint=hint

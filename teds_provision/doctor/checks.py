@@ -80,7 +80,7 @@ def examine(system: System) -> Iterator[tuple[Room, Finding]]:
     """Run every check in turn; one that fails in an unforeseen way is itself a finding, and the next one runs."""
     for module in _MODULES:
         import_module(f"teds_provision.doctor.{module}")  # fills the registry
-    _OF_ROOMS.parts()  # as well
+    _OF_ROOMS.parts()  # registers the checks of optional rooms
     for name, (room, look) in CHECKS.items():
         try:
             for finding in look(system):

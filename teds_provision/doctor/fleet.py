@@ -162,7 +162,7 @@ def seals(system: System) -> Iterator[Finding]:
     sample = RowSample(full=system.full)
     station = Station.open(system.home, ask=system.ask or _nobody)
     try:
-        if system.ask is None and station.identity.keystore != "keyring":  # which opens by itself, or not at all
+        if system.ask is None and station.identity.keystore != "keyring":  # a keyring opens without a prompt
             why = "Not checked: pins and trust need the vault, and no passphrase was given."
             yield Finding("seals", "skipped", why, "teds-provision --passphrase-fd 3 doctor 3<FILE")
             return

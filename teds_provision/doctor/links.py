@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from teds_provision.links.nfc import reader as nfc_reader
     from teds_provision.links.nfc import tag as nfc_tag
 else:
-    # nfcpy and pyserial, and what shares a bus: only if such a link was given
+    # Loaded only if such a link was given: nfcpy, pyserial, and the code for shared buses.
     bus_multiplexer = late("teds_provision.links.can.bus_multiplexer")
     nfc_reader, nfc_tag = late("teds_provision.links.nfc.reader"), late("teds_provision.links.nfc.tag")
 
@@ -303,9 +303,9 @@ def _shown(system: System, node: Path) -> str:
         return shown
 
 
-# What the doctor looks at around Bluetooth: adapters, switches, the service, roles and connections.
+# Checks around Bluetooth: adapters, switches, the service, roles and connections.
 #
-# Nothing is opened and no connection made; a fault is a failure only if BLE was requested.
+# Nothing is opened and no connection is made; a fault is a failure only if BLE was requested.
 
 _BLUETOOTH: Final = "bluetooth"
 _MANY: Final = 5

@@ -46,7 +46,7 @@ class Mask:
         }
         for link in (system.nfc, system.can, system.ble):
             private[(link or "").partition(":")[2]] = "ADDRESS"  # hosts and ports of this site
-        # the longest first, so that no path is cut by a folder above it
+        # The longest first, so that replacing a folder does not cut the paths below it.
         self._private = sorted(
             ((word, name) for word, name in private.items() if len(word) > 1), key=lambda pair: -len(pair[0])
         )
@@ -66,7 +66,7 @@ class Mask:
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a container's user without a name
+    except (KeyError, OSError):  # a user without a name, as in a container
         return ""
 
 
@@ -97,7 +97,7 @@ def _packages() -> dict[str, str]:
     versions = {}
     try:
         requirements = metadata.requires("teds-provision") or []
-    except metadata.PackageNotFoundError:  # run from a copy that is not installed
+    except metadata.PackageNotFoundError:  # run from a copy that was not installed
         requirements = []
     for requirement in requirements:
         name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]

@@ -132,7 +132,7 @@ def _backups(log: AuditLog, nodes: int) -> Iterator[Finding]:
 def keyring(system: System) -> Iterator[Finding]:
     """Check which keyring would hold the keys, whether it is permitted, and answers; a failure only if it is used."""
     used = _keystore(system)
-    if used not in (None, "keyring"):  # looking for one takes longer than all other checks
+    if used not in (None, "keyring"):  # looking for a keyring takes longer than all other checks
         yield Finding("keyring", "skipped", "Not used by this station.")
         return
     try:
@@ -197,7 +197,7 @@ def _file_vault(system: System) -> Finding:
         if content.get("store") != opened.id:
             raise VaultError("vault.json belongs to another store.", hint="teds-provision restore FILE")
     memory = content.get("memory_kib")
-    if not isinstance(memory, int) or memory < 19 * 1024:  # OWASP's least for Argon2id
+    if not isinstance(memory, int) or memory < 19 * 1024:  # OWASP's minimum for Argon2id
         return Finding("vault", "warning", "The passphrase file has weak demo settings.", "Create a new station.")
     return Finding("vault", "ok", f"The passphrase file exists (Argon2id, {memory >> 10} MiB).")
 
@@ -209,7 +209,7 @@ def _keystore(system: System) -> str | None:
         with Station.inspect(system.home) as opened:
             facts = opened.identity.record()
             return facts.keystore if facts is not None else None
-    except StoreError:  # the check of the store reports it
+    except StoreError:  # the check of the store reports this
         return None
 
 

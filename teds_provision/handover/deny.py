@@ -74,7 +74,8 @@ def _has_authority(station: Station, statement: Statement) -> bool:
     tombstone = station.policy.tombstone(uuid)
     if tombstone is not None and tombstone.to_fingerprint == signer:
         return True
-    if station.policy.in_roster(signer):  # every member is certified by the CA: among them that is not enough
+    # the CA certifies every member, so a certificate alone gives no authority among them
+    if station.policy.in_roster(signer):
         roster = station.plant.roster
         return roster is not None and roster.has(signer, "keeper")
     point = station.policy.station_points().get(signer)

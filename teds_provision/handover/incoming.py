@@ -37,7 +37,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.database import chunks
 from teds_provision.station.store.records import Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, utc_now
 
-# Nodes that come with a bundle: what becomes of each, and the rows of those that are taken in.
+# The nodes in a bundle: what is done with each, and the rows of those that are accepted.
 
 Decision = Literal["new", "newer", "same", "refused"]
 
@@ -162,7 +162,7 @@ class ImportedRows:
                 marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has held this key"}
             if planned.decision == "same" or self.cas.get(uuid, own) == ca:
                 continue
-            if planned.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
+            if planned.decision == "newer":  # keep the present key and its CA until a session proves the new one
                 kept: dict[str, Any] = {"next_key_id": planned.node.kid, "next_ca": ca}
             else:
                 kept = {"ca": ca}
@@ -452,10 +452,10 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
     for digits, signature in bundle.station_signatures.items():
         point = points.get(digits)
         if point is not None and digits != station.fingerprint:
-            station.identity.keep_certificate(bundle.ca, point, signature)  # which verifies it
+            station.identity.keep_certificate(bundle.ca, point, signature)  # checks the signature
 
 
-# A node counts as taken over when it opened a session here, under a key that after a move is new.
+# A node counts as taken over once it has opened a session here, after a move under a new key.
 
 
 @dataclass(frozen=True)

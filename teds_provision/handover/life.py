@@ -43,7 +43,8 @@ def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
         now = datetime.now(UTC)
         key = station.vault.identity()
         pinned = station.pins.pinned(uuid)
-        banned = pinned if is_whole(pinned) else None  # a statement names a whole fingerprint, or every key of the UUID
+        # a statement names a whole fingerprint; without one it bans all keys of the UUID
+        banned = pinned if is_whole(pinned) else None
         statement = seal_revocation(key, uuid=uuid, node=banned, why=why, created=now)
     with station.transaction():
         if statement is not None:
@@ -126,8 +127,8 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     blocks = {
         block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
     }
-    # The channel of its origin decides whether a calibration fits the spare's channel. Its certificate stays behind:
-    # it is about another sensor.
+    # The spare's channel is compared with the old TransducerChannel TEDS to see if the calibration fits. The
+    # certificate is left out: it is about another sensor.
     described = [(number, AccessCode.CHANNEL) for number, _ in blocks]
     blocks |= {block: image.blocks[block] for block in described if block in image.blocks}
     if not blocks:

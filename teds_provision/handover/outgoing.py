@@ -38,10 +38,10 @@ from teds_provision.station.store.records import (
     utc_now,
 )
 
-# Which nodes an export takes, and why others stay.
+# Which nodes an export includes, and why others are left out.
 
 DEFAULT_DAYS = 7
-OUT_OF_SERVICE = ("decommissioned", "replaced by")  # the words of handover/life.py
+OUT_OF_SERVICE = ("decommissioned", "replaced by")  # the words that handover/life.py writes
 _UNKNOWN = "its public key is not known"
 _CURE = "See teds-provision nodes UUID; any session settles it, or: teds-provision agree UUID --rotate"
 
@@ -469,7 +469,8 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
 def _other_holders(station: Station, nodes: Chosen, receivers: tuple[TrustRecord, ...]) -> tuple[str, ...]:
     """Return the stations, other than the receivers, that hold any of these keys since an earlier copy."""
     to = {record.fingerprint for record in receivers}
-    if station.keys.all_holders() <= to:  # there may be 100,000 rows, and stations are few
+    # quick check first: there may be 100,000 rows of holders and only a few stations
+    if station.keys.all_holders() <= to:
         return ()
     chosen = {node.uuid for node in nodes}
     found = {holder.fingerprint for holder in station.keys.holders() if holder.uuid in chosen}
@@ -503,7 +504,7 @@ def _sealing(station: Station, plan: ExportPlan, now: datetime) -> EnvelopeWrite
         mode=plan.mode,
         ca=plan.ca,
         nodes=(),
-        # The sender's own goes along, so that the receiver can hand the nodes back one day.
+        # The sender's own certificate is included, so that the receiver can hand the nodes back later.
         station_signatures={**plan.signatures, **({station.fingerprint: own} if own else {})},
         revoked=tuple(revocation.statement for revocation in station.policy.revocations()),
     )

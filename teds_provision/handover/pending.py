@@ -78,7 +78,8 @@ def content_digest(
     )
     comma = ""
     for chunk in chunks(nodes):
-        # as JSON, by hand: hex digits and a number need no quoting, and there may be ten thousand
+        # JSON put together by hand for speed: there may be ten thousand nodes, and hex digits and numbers need no
+        # quoting.
         listed = [f'["{uuid.hex()}","{identifier}",{epoch}]' for uuid, identifier, epoch in chunk]
         digest.update(f"{comma}{','.join(listed)}".encode())
         comma = ","
@@ -215,7 +216,7 @@ def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -
         if tombstone is None or tombstone.handover_id != row.id:
             continue
         for key in station.keys.keys_of(uuid):
-            # rows of version 1 do not name the keys: then those that were in use when the bundle was made
+            # Rows of version 1 do not name the keys: then assume those that existed when the bundle was made.
             in_bundle = left.get(uuid.hex(), "") or (key.key_id if key.created <= row.created else "")
             if key.key_id == in_bundle:
                 station.keys.remove_key(uuid, key.key_id)

@@ -22,11 +22,13 @@ from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.ca_file import read_ca
 from teds_provision.vault.selection import asked_first, create_vault
 
-# One CA for several stations: a station asks, the CA's keeper signs (profile.md, "Keys and trust").
+# One CA for several stations: a station requests a certificate, and the CA's holder signs it.
+# See profile.md, "Keys and trust".
 #
-# Two small JSON files travel, neither secret. The *request*: name, public key, and the station's own signature over
-# ``"TEDS1 station request" ‖ 00 ‖ P(station) ‖ name``, so that nobody asks in another's name. The *certificate*: the
-# CA's key and SIG104 over the station's. Both formats are this tool's, the profile knows only SIG104.
+# Two small JSON files are exchanged; neither is secret. The *request*: name, public key, and the station's own
+# signature over ``"TEDS1 station request" ‖ 00 ‖ P(station) ‖ name``, so that a station cannot request a certificate in
+# another's name. The *certificate*: the CA's key and SIG104 over the station's. Both formats are this tool's own; the
+# profile defines only SIG104.
 
 REQUEST_FORMAT = "teds-station-request/1"
 CERTIFICATE_FORMAT = "teds-station-certificate/1"
@@ -205,7 +207,7 @@ def _adopt(station: Station, certificate: Certificate) -> None:
     with station.transaction():
         if fresh:
             identity.complete(own, certificate.ca, certificate.signature)
-        else:  # a station with another CA: certified by this one too, for the nodes of that one
+        else:  # this station already has another CA: keep this certificate too, for that CA's nodes
             identity.keep_certificate(certificate.ca, station.point, certificate.signature)
         station.audit("init", None, "certified", ca=fingerprint(certificate.ca), own=fresh)
 

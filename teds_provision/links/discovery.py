@@ -115,7 +115,7 @@ class Discovery:
     def __init__(self, place: str, sightings: SightingSink, poll: float | None) -> None:
         self._presence, self._poll = sightings, poll
         self._stop, self._asked = threading.Event(), threading.Event()
-        self._begun = self._finished = 0  # rounds of questions
+        self._begun = self._finished = 0  # counts of rounds
         self._turn = threading.Condition()
         self.failure: LinkError | None = None
         self._thread = threading.Thread(target=self._run, name=f"look-out {place}", daemon=True)
@@ -134,7 +134,7 @@ class Discovery:
     def discover(self, seconds: float | None = None) -> None:
         """Send a broadcast now, and wait until that is done; raises LinkError if the link has failed."""
         with self._turn:
-            wanted = self._begun + 1  # a round that is under way may be past the node that has just come
+            wanted = self._begun + 1  # the present round may already have passed the new node
             self._asked.set()
             longest = self.LONGEST if seconds is None else seconds
             self._turn.wait_for(lambda: self._finished >= wanted or self._stop.is_set(), longest)

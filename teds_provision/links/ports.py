@@ -15,7 +15,7 @@ from teds_provision.protocol.messages.identity import Identity
 if TYPE_CHECKING:
     import socket
 else:
-    socket = late("socket")  # most commands open none
+    socket = late("socket")  # most commands open no socket
 
 NoticeKind = Literal[
     "waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "unfinished", "retry", "pressed"
@@ -458,7 +458,7 @@ class LinkSettings:
         return replace(self, via="ble") if self.onward else self
 
 
-# Ports of this machine's own loopback: for simulated readers and buses, and for a page that is tried out.
+# Ports on this machine's loopback: for simulated readers and buses, and for trying out the web page.
 
 
 def free_port(kind: socket.SocketKind | None = None) -> int:

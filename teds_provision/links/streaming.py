@@ -101,7 +101,7 @@ class MeasuringLink(Port, ABC):
     def airtime(self, node: int | None = None) -> Airtime:
         """Return what messages of this node take of the link; None: of any node, at worst."""
 
-    # -- acting ----------------------------------------------------------------------------------------------------
+    # -- actuators -------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def drive(self, node: int, message: bytes) -> None:
@@ -112,7 +112,7 @@ class MeasuringLink(Port, ABC):
         del token
         return False
 
-    # -- who is there ----------------------------------------------------------------------------------------------
+    # -- discovery -------------------------------------------------------------------------------------------------
 
     def discover(self, sightings: SightingSink, *, poll: float | None = None) -> Discovery:
         """Begin to find nodes, in another thread: while one is missing, and every ``poll`` seconds."""
@@ -126,7 +126,7 @@ class MeasuringLink(Port, ABC):
         del node, seconds, until_announced
         return None
 
-    # -- others on the bus -----------------------------------------------------------------------------------------
+    # -- other stations on the bus ---------------------------------------------------------------------------------
 
     @property
     def shared_bus(self) -> SharedBus | None:

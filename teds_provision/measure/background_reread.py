@@ -23,10 +23,11 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import iso
 from teds_provision.teds.image import Image
 
-GAP: Final = 1  # ms between the frames of a reply: of a bus of 500 kbit/s three quarters stay free meanwhile
-SPARING: Final = 4.0  # times as long as an exchange took nothing more is read
-FIRST: Final = 1.0  # seconds from the first value on in which nothing is read: others on the bus are about to begin
-PATIENCE: Final = 60.0  # seconds for which nodes that begin go first: one may begin again and again
+GAP: Final = 1  # ms between the frames of a reply: three quarters of a 500 kbit/s bus remain free
+SPARING: Final = 4.0  # pause after an exchange, as a multiple of its duration
+FIRST: Final = 1.0  # seconds after the first value before reading begins: other nodes on the bus may be about to start
+# seconds for which nodes that start have priority; limited, since one may restart again and again
+PATIENCE: Final = 60.0
 AGAIN: Final = 10.0  # seconds until the next try if the node did not answer, or was busy
 TRIES: Final = 5
 
@@ -67,7 +68,7 @@ class BackgroundReread:
             GarbledError,
             NodeRefusedError,
             BadDataError,
-        ):  # its data still come, or the supervisor finds that they do not
+        ):  # the data go on, or the supervisor notices that they have stopped
             self.close()
             self._steps, self._due = read_in_between(self._verified.node, gap=GAP), began + AGAIN
             self._left -= 1

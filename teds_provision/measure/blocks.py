@@ -48,9 +48,9 @@ class ChannelFacts:
     fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty if it is unsigned
     sample_form: str = ""  # of the raw value, as its SampleForm is called: "unsigned integer, 2 octets"
     period: float | None = None  # seconds between samples as measured; None for events
-    unsigned: bool = False  # the datasheet is unsigned: there are raw values alone
-    unverified: bool = False  # it is unsigned, and values are calibrated by it all the same: an operator confirmed
-    quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty if unknown
+    unsigned: bool = False  # the datasheet is unsigned, so there are only raw values
+    unverified: bool = False  # the datasheet is unsigned, but an operator confirmed that values are calibrated by it
+    quantity: str = ""  # from the profile or the name, e.g. "relative humidity"; empty if unknown
     deviation: float | None = None  # standard deviation in `unit`, if the profile has one
     own_period: float | None = None  # seconds between samples as the datasheet has it (SPeriod)
     frame: str = ""  # coordinate frame of its values; {node} in it is replaced by the node's part of its topics
@@ -59,9 +59,10 @@ class ChannelFacts:
     si_factor: float | None = None  # SI = number × factor + offset
     si_offset: float | None = None
     wrapped: str = ""  # sensor that the node wraps: its proof ends at the wrapper; empty for every other node
-    vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
+    vector: tuple[int, ...] = ()  # channels of its vector group, axis by axis; empty if it is in none
 
-    chosen: tuple[tuple[int, str], ...] | None = None  # names of its topics by channel (0: the node's part), if newer
+    # chosen names of its topics by channel (0: the node's part); None: not newer
+    chosen: tuple[tuple[int, str], ...] | None = None
     siblings: tuple[tuple[int, str], ...] = ()  # number and name of every channel of the datasheet, for topics
 
     @property
@@ -100,8 +101,9 @@ class Block:
     raw: NDArray[Any]  # (n, c)
     value: NDArray[Any]  # (n, c) float64
     valid: NDArray[Any]  # (n, c) bool
-    age: float = 0.0  # seconds from the last instant to the moment when the block was handed on
-    clock_error: float | None = None  # bound of the error of `time` in seconds; None: none is known, or the clock lies
+    age: float = 0.0  # seconds from the last instant until the block was passed on
+    # bound of the error of `time` in seconds; None: unknown, or the clock is inconsistent
+    clock_error: float | None = None
     test_pattern: bool = False
     run: int = 0  # number of the run of the stream in its session
     clock: int | None = None  # which setting of the host's clock `time` follows; None: the present one
@@ -224,7 +226,7 @@ class SetPointCommand:
     uuid: str
     channel: int
     value: float
-    received: float  # time.monotonic() when it was taken
+    received: float  # time.monotonic() at arrival
 
 
 @dataclass
@@ -234,11 +236,11 @@ class SinkStats:
     Not frozen: each sink counts in its own, and a new one for each item took longer than to write the item.
     """
 
-    written: int = 0  # samples (values) that went out
-    dropped: int = 0  # samples that a slow consumer cost; of a recorder, those that a full disk did
+    written: int = 0  # samples (values) written or sent
+    dropped: int = 0  # samples lost to a slow consumer; for a recorder, to a full disk
     octets: int = 0
     messages: int = 0
-    lag: float = 0.0  # seconds by which the last item waited in the queue
+    lag: float = 0.0  # seconds that the last item waited in the queue
     state: Literal["starting", "running", "waiting", "ended", "failed"] = "starting"
     detail: str = ""  # e.g. "waits for a ROS master at http://localhost:11311"
     error: str = ""

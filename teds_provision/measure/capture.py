@@ -60,7 +60,7 @@ def capture_at(
     steps = Steps(reporter)
     with (
         own_source_address(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
-        at_node(station, own, uuid, reporter) as visit,  # its turn is the file's too
+        at_node(station, own, uuid, reporter) as visit,  # the node stays locked while the file is written
     ):
         try:
             trusted = open_trusted(station, visit.node, by=_NAME)

@@ -23,19 +23,19 @@ import numpy as np
 from teds_provision.arrays import NDArray
 from teds_provision.protocol.operation.subscription import TickBounds
 
-OWN_DRIFT = 50.0  # ppm that the host's clock may be off beside the node's
+OWN_DRIFT = 50.0  # ppm by which the host's clock may be off, added to the node's
 NODE_DRIFT = 100.0  # ppm, until the node has reported its own
-AT_FIRST = 5  # exchanges that a station does at once: one alone may have met a long delay
-EXCHANGES = 64  # kept: at one each 3.3 s three and a half minutes
-WINDOW = 30_000_000_000  # ns of arrivals under the hull
-BUCKET = 50_000_000  # ns: the best arrival represents each
+AT_FIRST = 5  # exchanges at the start: a single one may have had a long delay
+EXCHANGES = 64  # exchanges kept: three and a half minutes at one each 3.3 s
+WINDOW = 30_000_000_000  # ns of arrivals in the hull
+BUCKET = 50_000_000  # ns; the best arrival represents each bucket
 REFIT_AFTER = 10  # buckets
-SLEW = 1_000_000_000  # ns over which a refit's difference is let out
-SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they are evidence about skew
-END_OF_TICKS = 1 << 63  # 292 years of ns since the node's start: no tick is so late
+SLEW = 1_000_000_000  # ns over which a refit's difference is phased in
+SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals that are needed to estimate skew
+END_OF_TICKS = 1 << 63  # 292 years of ns since the node's start: later ticks are impossible
 ANY_TICK = TickBounds(-(1 << 64), 1 << 64)  # without evidence
-STEP = 1e-3  # seconds by which the system's clock must have been set to count; less belongs to the bound
-SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they are better evidence about it than the arrivals
+STEP = 1e-3  # seconds: a smaller change of the system's clock does not count as a step, and is within the bound
+SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges from which they estimate skew better than arrivals
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,19 @@ class ClockMap:
     def __init__(self, own_drift: float = OWN_DRIFT) -> None:
         self.lie = ""
         self._own = own_drift
-        self._rate = (own_drift + NODE_DRIFT) / 1e6  # ns of doubt for each ns of age
-        # Of the last EXCHANGES, oldest first: plain numbers, as a station has these of each of its nodes.
+        self._rate = (own_drift + NODE_DRIFT) / 1e6  # growth of uncertainty, in ns per ns of age
+        # The last EXCHANGES, oldest first. Plain numbers save memory: a station has these for each of its nodes.
         self._ticks, self._offsets, self._errors = array("q"), array("d"), array("d")
         self._hull = LowerHull()
-        self._low, self._high, self._when = -math.inf, math.inf, 0  # what the evidence allows, at tick `_when`
-        self._origin = 0  # tick of the line's offset
+        # bounds that follow from the evidence, at tick `_when`
+        self._low, self._high, self._when = -math.inf, math.inf, 0
+        self._origin = 0  # tick to which the line's offset applies
         self._offset = 0.0
         self._skew = 0.0
-        self._residue = 0.0  # what the last refit still lets out
+        self._residue = 0.0  # the part of the last refit that is not phased in yet
         self._refitted = 0  # tick of that refit
         self._known = False
-        self._handed_out = False  # True if stamps were given out: before that a refit may step
+        self._handed_out = False  # True if stamps were given out: until then a refit may step
 
     @property
     def known(self) -> bool:
@@ -113,7 +114,7 @@ class ClockMap:
         else:
             if (exchange.drift + self._own) / 1e6 > self._rate:
                 self._rate = (exchange.drift + self._own) / 1e6
-                self._low, self._high = -math.inf, math.inf  # what was gathered held for a better clock
+                self._low, self._high = -math.inf, math.inf  # the old bounds assumed a better clock
             low, high = self._limits(exchange.tick)
             if exchange.offset - exchange.error > high or exchange.offset + exchange.error < low:
                 self.lie = "two exchanges contradict each other: the node's clock was set or runs at the wrong speed"
@@ -122,7 +123,8 @@ class ClockMap:
             self._narrow(exchange.tick, exchange.offset - exchange.error, exchange.offset + exchange.error)
             self._refit(exchange.tick)
             return True
-        if not self._known:  # stamps go on: until a sample arrives, the end of the reply is all that there is
+        # stamps are still needed: until a sample arrives, the end of the reply is the only evidence
+        if not self._known:
             self._origin, self._offset = exchange.sent, float(exchange.answered - exchange.sent)
         return False
 
@@ -135,7 +137,7 @@ class ClockMap:
     def arrival(self, tick: int, host: int) -> None:
         """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
         upper = host - tick
-        # What _narrow does, with an upper limit alone.
+        # As in _narrow, with only an upper limit.
         age = tick - self._when
         if age > 0:
             doubt = self._rate * age
@@ -153,7 +155,7 @@ class ClockMap:
         slope: NDArray[Any] = self._offset + self._skew * (signed - self._origin)
         if self._residue:
             slope += self._residue * np.clip(1.0 - (signed - self._refitted) / SLEW, 0.0, 1.0)
-        # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
+        # Whole nanoseconds first: as floats, a tick of months and an offset of years would lose microseconds.
         whole: NDArray[np.float64] = (signed + np.rint(slope).astype(np.int64)) / 1e9
         return whole
 
@@ -173,7 +175,7 @@ class ClockMap:
 
     def lead_bounds(self, host: int) -> TickBounds:
         """Return the bounds by which the node's tick may be ahead of a host time (monotonic ns) at that time."""
-        # The tick itself is the line's; what skew adds to its offset changes this doubt by some ns in a minute.
+        # The tick itself comes from the line; skew would change this uncertainty by only some ns in a minute.
         doubt = self._rate * abs(host - self._offset - self._when) + 1.0
         low, high = self._low - doubt, self._high + doubt
         if low == -math.inf or high == math.inf:
@@ -237,7 +239,7 @@ class ClockMap:
         edge, skew = self._by_arrivals(tick)
         if len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:
             skew = self._skew_of(at, offsets - base, errors)
-        # The skew is known the better the longer was seen, and as well as the best exchange is over that time.
+        # The longer the time seen, the better the skew is known; its error is that of the best exchange over that time.
         seen = max(self._hull.span, at.max() - at.min(), SPAN_OF_A_HULL)
         carried = offsets - base - skew * at
         widened = errors + min(self._rate * SPAN_OF_A_HULL, errors.min()) / seen * np.abs(at)
@@ -246,7 +248,7 @@ class ClockMap:
 
     def _skew_of(self, at: NDArray[Any], offsets: NDArray[Any], errors: NDArray[Any]) -> float:
         """Return the skew of a weighted line through exchanges, held within the drift."""
-        # A round trip's excess over the quickest one is delay that fell on one way or the other: weak evidence.
+        # A round trip longer than the quickest one had a delay in one direction or the other: weak evidence.
         weights = 1.0 / (errors - 0.9 * errors.min() + 1_000.0) ** 2
         middle, level = np.average(at, weights=weights), np.average(offsets, weights=weights)
         skew = float(np.sum(weights * (at - middle) * (offsets - level)) / np.sum(weights * (at - middle) ** 2))
@@ -276,9 +278,9 @@ class LowerHull:
 
     def __init__(self) -> None:
         self.count = 0
-        self._ticks, self._uppers = array("q"), array("q")  # of closed buckets: of a fast stream some hundred
-        self._best = (0, 0)  # of the bucket that is still open, if ``count`` shows that there is one
-        self._end = 0  # tick at which it ends
+        self._ticks, self._uppers = array("q"), array("q")  # of closed buckets; a fast stream has some hundred
+        self._best = (0, 0)  # of the open bucket, which exists if ``count`` is not 0
+        self._end = 0  # tick at which the open bucket ends
         self._hull: list[tuple[int, int]] = []
 
     def add_arrival(self, tick: int, upper: int) -> bool:
@@ -286,7 +288,7 @@ class LowerHull:
         if tick >= END_OF_TICKS:
             return False
         if tick < self._end:
-            # Of another stream it may be a little older than what came before it: then it adds nothing.
+            # An arrival of another stream may be a little older than the open bucket; then it is ignored.
             if upper < self._best[1] and tick >= self._end - BUCKET:
                 self._best = (tick, upper)
             return False

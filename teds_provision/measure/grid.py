@@ -17,16 +17,16 @@ import numpy as np
 from teds_provision.arrays import NDArray
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 
-PERIODS_OF_A_VALUE = 2.0  # then it is too old to represent the channel
-LONGEST_BURST = 10_000  # rows at once; a longer gap of all streams is left out
+PERIODS_OF_A_VALUE = 2.0  # periods after which a value is too old to represent the channel
+LONGEST_BURST = 10_000  # rows at once; after a longer gap in all streams, older rows are left out
 
 
 @dataclass
 class _Stream:
     channels: tuple[int, ...]
     columns: list[int]
-    place: slice | list[int]  # the same; as a slice if they are adjacent, which numpy reaches more quickly
-    keeps: float  # seconds that a value represents its channels
+    place: slice | list[int]  # the columns; as a slice if they are adjacent, which numpy indexes faster
+    keeps: float  # seconds for which a value represents its channels
     times: list[NDArray[Any]] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
     newest: float = -math.inf
@@ -52,7 +52,7 @@ class Grid:
             for channel_facts in facts
         }
         self._streams: dict[tuple[str, int], _Stream] = {}
-        self._next: int | None = None  # number of the next row: its time is number × period
+        self._next: int | None = None  # number of the next row, whose time is number × period
         self._test = False
 
     def add_block(self, block: Block) -> None:
@@ -94,7 +94,7 @@ class Grid:
             stream.newest for stream in self._streams.values() if stream.newest > now - stream.keeps - self.patience
         ]
         ready = min(live) if live else -math.inf
-        # The small number lets a rounded stamp count for the row that it was taken for.
+        # The small number makes up for rounding, so that a stamp counts for its own row.
         until = math.floor(max(ready, now - self.patience) / self.period + 1e-6)
         if until < self._next:
             return None
@@ -136,6 +136,6 @@ def _fill(stream: _Stream, rows: NDArray[Any], upto: NDArray[Any], value: NDArra
         value[good[:, None], stream.columns] = values[place[good]]
         age[good[:, None], stream.columns] = np.maximum(old[good], 0.0)[:, None]
     kept = int(place[-1])
-    # What a later row may still need: the last value before the next row, and all after it.
+    # Later rows may still need the last value before the next row, and all later ones.
     if kept > 0:
         stream.times, stream.values = [times[kept:]], [values[kept:]]

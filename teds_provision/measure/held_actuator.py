@@ -23,7 +23,7 @@ from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Channel
 from teds_provision.teds.units import WrittenUnit, parse_unit
 
-LONGEST_PAUSE = 0.5  # seconds; a node that may not be moved any more is let go within two
+LONGEST_PAUSE = 0.5  # seconds; a node that may no longer be moved is released within two
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class HeldActuator:
             state, _ = operation(self._verified.node).channels[self.channel.number]
             self.safe = bool(state & ChannelState.SAFE)
         except (TedsProvisionError, SessionLostError, KeyError):
-            self.safe = None  # it cannot be reported from here; the node's dead-man takes care of it
+            self.safe = None  # unknown here; the node's dead-man makes the actuator safe
 
     def require_confirmation(self) -> bool:
         """Return True if the node reported its safe state at release; raise LinkError if it did not answer."""

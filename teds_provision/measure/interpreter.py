@@ -112,7 +112,7 @@ class StreamInterpreter:
             self._count_invalid(raws, valid, flagged)
         steps, seconds = self._spaced(first, count)
         span = int(steps[-1])
-        # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
+        # Whole nanoseconds first: as floats, a tick of months and an offset of years would lose microseconds.
         host, rate, bound = self._clock.line(first.tick, first.tick + span)
         times = seconds * rate
         times += host / 1e9

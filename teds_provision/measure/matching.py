@@ -40,7 +40,7 @@ from teds_provision.teds.sheet import Sheet
 
 _BOUND = re.compile(r"[<>]")
 _KINDS = ("type", "name", "group")
-_LONGEST = 64  # characters of a name that is looked for
+_LONGEST = 64  # longest name that is searched for, in characters
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
     try:
         kind = request.stream_kind
         plans = plan_node(sensors_of(sensors, (), kind), time, rate=request.rate, kind=kind, at_most=True)
-    except (BadDataError, PolicyError):  # its session will show it
+    except (BadDataError, PolicyError):  # the node's session will report it
         return NodeLoad()
     rates = [1 / period for period in plans.periods().values() if period > 0]
     return NodeLoad(plans.load, len(rates), max(rates, default=0.0))
@@ -263,7 +263,7 @@ def _profile(kind: str, home: Path) -> Profile | None:
         return None
 
 
-@lru_cache(maxsize=16)  # asked for each node after each change of the store
+@lru_cache(maxsize=16)  # called for each node after each change of the store
 def _read_profile(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> Profile:
     return load_profile(path, folders)
 

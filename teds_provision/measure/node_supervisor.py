@@ -59,18 +59,18 @@ from teds_provision.teds.sheet import Channel
 
 _log = logging.getLogger(__name__)
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
-LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
+LOOKING = 2.0  # seconds to search for a node that ran before, between its reports
 WORKED_ON, NOTICE_AFTER, LONGEST_WORK = 0.05, 0.5, 60.0
 """Seconds between checks whether a command works on the node, until that is reported, and until it counts as hung."""
-LOOK = 0.2  # seconds between looks at how it does while something is about to happen
-CALM = 0.5  # seconds between them while nothing is: a thousand nodes are a thousand threads that wake
-LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
-ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
-DECIDED = 0.5  # seconds between looks whether this station's own decision against a node was taken back
-AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
-SLOWER = 10  # halvings of the rate while the firmware reports that its shortest period is longer
-UNLOCKED = 1.0  # seconds between looks whether the vault is open again
-BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tried again as after any other error
+LOOK = 0.2  # seconds between checks of the node while a change is expected
+CALM = 0.5  # seconds between checks otherwise: with a thousand nodes, a thousand threads wake up
+LOOK_FOR_DATA = 0.4  # seconds after an Announce; data within them mean that another device sent it
+ANNOUNCED = 1.0  # seconds after an Announce without data until the node is asked
+DECIDED = 0.5  # seconds between checks whether this station's own decision against a node was withdrawn
+AT_ONCE = 1.0  # least seconds between two tries, however often Announces with this UUID arrive
+SLOWER = 10  # the rate is halved up to this often if the firmware's shortest period is longer
+UNLOCKED = 1.0  # seconds between checks whether the vault is unlocked again
+BUSY = 2.0  # seconds for which a busy node is asked again at once; then it is treated like any other error
 
 
 class NodeSupervisor:
@@ -92,28 +92,28 @@ class NodeSupervisor:
         self.ever_ran = False
         self.verified: VerifiedSession | None = None
         self.streams = NodeStreams(host, events.block)
-        self.turn = threading.Lock()  # of the session: one exchange at a time
-        self.ready = threading.Event()  # streams were asked for
+        self.turn = threading.Lock()  # held during each exchange of the session
+        self.ready = threading.Event()  # the streams were subscribed
         self.done = threading.Event()
         self._station, self._buses = station, buses
         self.bus: MeasuredBus | None = None  # its place, once it was found
         self._request, self._events, self._common_start = request, events, common_start
         self._stop = threading.Event()
         self._anew = threading.Event()
-        self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
-        self._elsewhere = 0.0  # when it answered at another place
+        self._announced = 0.0  # time.monotonic() of its Announce; 0: none
+        self._elsewhere = 0.0  # time.monotonic() when it answered at another place
         self._lost_at = 0.0
-        self._proven = True  # whether what failed last did so under the node's key
+        self._proven = True  # True if the last failure came under the node's key
         self._retry_policy = RetryPolicy(None)
-        self._standing: NodeStanding | None = None  # of the present try
+        self._standing: NodeStanding | None = None  # of the current try
         self.sighting: Sighting | None = None  # its last place
         self._halved = 0
         self._lease, self._claimed = request.lease, [0]
         self._driven: TopicActuators | None = None
         self._told = ""
-        self._comes_back = False  # it is let go for a while, and its room is kept for it
+        self._comes_back = False  # it is released for a while, and its share of the bus is reserved
         self._firmware_warning = ""
-        self._why = ""  # why it was asked to end, for its last report
+        self._why = ""  # reason of the stop, for its last report
         self._thread = self._new_thread()
 
     def _new_thread(self) -> threading.Thread:
@@ -235,7 +235,7 @@ class NodeSupervisor:
             if now != changes and not why_not_measured(self._station, self.uuid):
                 break
             changes = now
-        self._buses.presence.let_announce(self.uuid)  # from here on it is looked for
+        self._buses.presence.let_announce(self.uuid)  # from now on the node is searched for
         self._stop.wait(max(0.0, began + AT_ONCE - time.monotonic()))
 
     def _failure(self) -> TedsProvisionError | None:
@@ -302,7 +302,7 @@ class NodeSupervisor:
             self._lost_at = time.monotonic()
             self._proven = self._proven and came_under_key(error)
             self._buses.presence.let_announce(self.uuid)
-            # Its refusal came under its key: it is there, and another measurement may want it now.
+            # A refusal under its key proves that the node is here, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
                 self._buses.presence.search_again(sighting)
             if not self._proven and isinstance(error, (TedsProvisionError, SessionLostError)):
@@ -310,7 +310,7 @@ class NodeSupervisor:
                     self._ask_who_answers()
                 conflict = self._buses.presence.conflict_at(sighting)
                 if conflict is not None:
-                    raise conflict from error  # whichever of the two answered
+                    raise conflict from error  # either of the two nodes may have answered
             raise
 
     def _ask_who_answers(self) -> None:
@@ -360,7 +360,7 @@ class NodeSupervisor:
                 self._keep(bus, trusted, standing)
                 answers = True
             except (NotAuthenticError, PolicyError, BadDataError, KeyStolenError):
-                answers = True  # what it was asked for would go on until its lease ends
+                answers = True  # the node answers, so stop its streams: otherwise they would go on until the lease ends
                 raise
             finally:
                 self._end(bus, trusted, sighting.address, answers=answers or self._stop.is_set())
@@ -465,7 +465,8 @@ class NodeSupervisor:
                 elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
                     raise
                 else:
-                    self._halved += 1  # the firmware's shortest period is longer than the datasheet's: nobody says it
+                    # the firmware's shortest period may be longer than the datasheet's, and no command reports it
+                    self._halved += 1
                 self.streams.stop(bus, trusted, address)
                 continue
             return plans
@@ -498,8 +499,8 @@ class NodeSupervisor:
         lied, mark = False, ""
         while not self._stop.is_set():
             if self._anew.wait(LOOK if rest is not None or self._announced or self._elsewhere else CALM):
-                self._anew.clear()  # something announced itself; the end sets _stop as well
-                self._stop.wait(LOOK)  # any device can announce, as often as it likes: that hurries nothing else
+                self._anew.clear()  # set by an Announce, and also by stop() together with _stop
+                self._stop.wait(LOOK)  # any device can send Announces at any rate: they must not speed up this loop
             standing.require()
             if standing.mark != mark:
                 mark = standing.mark
@@ -522,7 +523,8 @@ class NodeSupervisor:
                 lied = True
                 self._set_state("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
             silent = self.streams.silent(now)
-            if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
+            # the link failed (for example, the adapter was unplugged), not the node
+            if silent and (failure := bus.hearing.failure) is not None:
                 raise failure
             if silent:
                 raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
@@ -571,7 +573,7 @@ class NodeSupervisor:
         if self._driven is not None:
             self._driven.close()
             self._driven = None
-        with self.turn:  # a command of a request ends first, and no other begins in this session
+        with self.turn:  # a command in progress ends first, and no other starts in this session
             self.verified = None
         self._buses.presence.let_announce(self.uuid)
         self.streams.stop(bus, trusted if answers else None, address)
@@ -584,7 +586,7 @@ class NodeSupervisor:
         else:
             trusted.node.forget()
 
-    # -- telling ---------------------------------------------------------------------------------------------------
+    # -- reports ---------------------------------------------------------------------------------------------------
 
     def report(self) -> NodeReport:
         """Return the state of the node as it is now."""

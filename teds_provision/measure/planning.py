@@ -18,11 +18,11 @@ from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_
 from teds_provision.protocol.operation.subscription import StreamPlan, most_instants
 from teds_provision.teds.sheet import Channel, ChannelKind
 
-BLOCK = 20_000_000  # ns of samples in one message, about: what calibrates well in blocks and is not late yet
-UNSTATED = 100_000_000  # ns: the period of a channel without one in its datasheet
-LONGEST = 10**12  # ns, the contract's
+BLOCK = 20_000_000  # about so many ns of samples in one message: enough to calibrate in blocks, without much delay
+UNSTATED = 100_000_000  # ns: assumed for a channel whose datasheet has no period
+LONGEST = 10**12  # ns: the longest period that the contract permits
 MILLION = 10**6
-NODE_SHARE = 0.5  # of the node's own budget: room for commands between data frames
+NODE_SHARE = 0.5  # share of the node's own budget, so that commands fit between data frames
 MOST_GAP = 2_000  # µs
 SAYING = 1.0  # seconds that a node waits for the others to report their share of the bus
 
@@ -236,7 +236,7 @@ def _cut(paced: _Paced) -> list[_Group]:
     groups: list[_Group] = []
     for (period, how), members in paced.items():
         step = 1 if how == StreamKind.EVENT else MOST_STREAM_CHANNELS
-        # As even as can be: 25 channels as 13 and 12 make shorter messages than 16 and 9.
+        # As evenly as possible: 25 channels as 13 and 12 make shorter messages than 16 and 9.
         parts = math.ceil(len(members) / step)
         size = math.ceil(len(members) / parts)
         groups += [(period, how, members[at : at + size]) for at in range(0, len(members), size)]
@@ -273,7 +273,7 @@ def _plan(
     plan = StreamPlan.for_channels(
         number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern
     )
-    # Fuller messages if the bus is short of room: the overhead of a message is 13 octets.
+    # If the bus is nearly full, put more samples into a message: each message has 13 octets of overhead.
     while n < most and _load(plan, bus) > MOST_LOAD / 2 and kind != StreamKind.EVENT:
         n = min(most, 2 * n)
         plan = StreamPlan.for_channels(

@@ -17,11 +17,11 @@ from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
 from teds_provision.links.discovery import Sighting
 from teds_provision.protocol.announce import Announce, uuid_crc
 
-RECENT = 30.0  # seconds for which a conflict of addresses is the reason why a node is not found
-MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and a device at each of them can invent new ones
-REPEATED = 600.0  # seconds until the same trouble with addresses is reported again
-ROUND = 0.7  # seconds of two broadcasts, after which two boards at one address are known
-TWIN = 0.5  # seconds in which the node itself may answer as well, where one that says it is it was not
+RECENT = 30.0  # seconds for which an address conflict is reported as the reason why a node is not found
+MOST = 1024  # UUIDs kept: a bus has 239 addresses, but a device at any of them can invent new UUIDs
+REPEATED = 600.0  # seconds until the same address conflict is reported again
+ROUND = 0.7  # seconds of two broadcasts, after which two boards at one address are noticed
+TWIN = 0.5  # seconds to wait for the real node after another device used its UUID
 
 
 Place = tuple[str, int]
@@ -41,14 +41,16 @@ class Presence:
     _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
     _conflicts: dict[Place, tuple[float, AddressConflictError]] = field(default_factory=dict)
     _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
-    _placed: dict[Place, set[bytes]] = field(default_factory=dict)  # of those the nodes at each place,
-    _digested: dict[int, set[bytes]] = field(default_factory=dict)  # and by the CRC that an Announce has of a UUID
-    _missing: Counter[bytes] = field(default_factory=Counter)  # of the nodes that threads wait for: how many do
-    _missing_crcs: Counter[int] = field(default_factory=Counter)  # the same by the CRC that an Announce has of a UUID
-    _unseen: set[bytes] = field(default_factory=set)  # those that a thread waited for, and that were not seen since
-    _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
-    _reported: dict[str, float] = field(default_factory=dict)  # what was noted, and when
-    gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
+    _placed: dict[Place, set[bytes]] = field(default_factory=dict)  # UUIDs of _announced, by place
+    # and by the CRC of the UUID, which an Announce contains
+    _digested: dict[int, set[bytes]] = field(default_factory=dict)
+    # for each node that threads wait for: the number of threads
+    _missing: Counter[bytes] = field(default_factory=Counter)
+    _missing_crcs: Counter[int] = field(default_factory=Counter)  # the same, by the CRC of the UUID
+    _unseen: set[bytes] = field(default_factory=set)  # UUIDs that a thread waited for and that have not been seen since
+    _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they appear
+    _reported: dict[str, float] = field(default_factory=dict)  # notes that were made, with their times
+    gone: int = 0  # how often a node became missing that had been seen, or was not searched for before
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
     def add_sighting(self, sighting: Sighting) -> None:

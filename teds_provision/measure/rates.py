@@ -17,9 +17,9 @@ from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
 VALUES: Final = 50_000.0
 """Values a second that an idle machine with two cores recorded without losing one (docs/speed.md)."""
-SPARE: Final = 0.8  # of what came through a run that lost values
+SPARE: Final = 0.8  # share of the rate that arrived in a run with losses
 LEAST: Final = 0.1  # Hz
-BELOW: Final = 0.999  # of a rate: the next one below it is looked for
+BELOW: Final = 0.999  # factor below a rate; the next lower step is searched for from there
 _STEPS: Final = (5.0, 2.0, 1.0)
 Limit = Literal["datasheet", "bus", "budget", "machine"]
 

@@ -16,12 +16,12 @@ from teds_provision.shapes.measurement import MeasurementSpec
 from teds_provision.teds.fits import Fit, Requirement, judge, met
 from teds_provision.teds.sheet import Sheet
 
-# Whether the datasheets that were verified in the sessions suffice for the task (`measure --require`).
+# Requirements that the verified datasheets of a measurement must meet (`measure --require`).
 #
-# A requirement may be met by any node of the group, so each node waits until the others have shown their datasheets
-# (:data:`WAITING` at most), before anything is claimed. A node that comes back with another datasheet is judged anew.
+# Any node of the group may meet a requirement. So before channels are claimed, each node waits until the others have
+# shown their datasheets (at most :data:`WAITING`). A node that returns with another datasheet is checked again.
 
-WAITING = 10.0  # seconds from the first datasheet on
+WAITING = 10.0  # seconds, from the first datasheet
 
 
 class Requirements:
@@ -81,13 +81,15 @@ class MeasurementRequest(MeasurementSpec):
 
     lease: int = LEASE
     timeout: float = 60.0
-    patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
+    patient: bool = False  # wait for a node and retry without limit: no refusal is final
     unverified: bool = False  # only nodes with an unsigned datasheet, calibrated by it and marked so
-    requirements: Requirements | None = None  # what the text ``require`` says, held against all nodes of the run
+    requirements: Requirements | None = None  # the parsed text of ``require``, checked against all nodes of the run
     require_firmware: bool = False  # only nodes whose firmware their type accepts
-    newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
-    by: str = "measure"  # the command that a reading of the datasheet is put down to
-    beside: Mapping[bytes, str] = field(default_factory=dict)  # which process measures a node too, in words
+    # nodes come and go: no share of the bus is reserved for an absent one, and its first error ends it
+    newcomers: bool = False
+    by: str = "measure"  # the command that is recorded with a reading of the datasheet
+    # other processes that measure the same nodes, for messages
+    beside: Mapping[bytes, str] = field(default_factory=dict)
 
     @property
     def stream_kind(self) -> StreamKind | None:

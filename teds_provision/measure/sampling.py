@@ -20,7 +20,7 @@ from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units import WrittenUnit
 
 LEASE = 5
-ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
+ROOM = 180  # octets of data sets in one reply, so that it fits the maxMessage of any node
 
 
 @dataclass(frozen=True)

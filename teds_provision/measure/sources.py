@@ -33,7 +33,8 @@ def sole_user(station: Station, ports: Iterable[MeasuringLink], command: str) ->
             mark, source = _enter(stack, station, bus, command, shared=False)
             if source != bus.source:
                 port.use_source(source)
-            # After a process that was killed its nodes still send to us, for a lease: nobody else is behind that.
+            # After a killed process, nodes go on sending to our address until their lease ends; that is not another
+            # station.
             if not mark.left_behind:
                 port.require_sole_source()
         yield
@@ -57,7 +58,7 @@ def own_source_address(
         for place, bus in buses.items():
             mark, source = _enter(stack, station, bus, command, shared=shared)
             if not shared:
-                mark.share()  # the sessions of this very command are no others
+                mark.share()  # the sessions of this command do not count as others
             places.append(with_source(place, source))
         yield links.at_places(places)
 

@@ -86,8 +86,8 @@ class NodeStanding:
     def __init__(self, station: Station, uuid: bytes) -> None:
         self._station, self._uuid = station, uuid
         self._changes, self._judged = station.changes(), 0.0
-        self._good = time.time()  # no decision against the node was made before this moment
-        self._stolen = station.keys.stolen(uuid)  # known when it began: the session was opened all the same
+        self._good = time.time()  # up to this moment there was no decision against the node
+        self._stolen = station.keys.stolen(uuid)  # known before the session was opened, so it does not end it
         self.drives = self.unsigned = False
         self.mark = ""
         self.ended: TedsProvisionError | None = None

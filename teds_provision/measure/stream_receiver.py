@@ -20,12 +20,13 @@ from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.protocol.operation.subscription import Receiver, StreamMessage
 
-SLICE = 0.004  # seconds between looks at what waits
-REST = 0.003  # seconds that frames gather on one link: to be woken for each of them costs more than to read it
-GATHER = 0.012  # seconds that messages wait to be opened and calibrated together: of a tick's 20 ms to its sink
-HEARD_OUT = 0.25  # seconds for the last message that is wanted to come
-LOOKED_AT = 2.0  # seconds for the hearing thread to look at what has come: a node is let go within 4 s
-MOST_EARLY = 512  # messages of a stream that came before the reply to its Subscribe was looked at
+SLICE = 0.004  # seconds between checks for frames
+REST = 0.003  # seconds for which frames gather on one link: waking for each one costs more than reading it
+# seconds for which messages gather, to be opened and calibrated together: part of the 20 ms from tick to sink
+GATHER = 0.012
+HEARD_OUT = 0.25  # seconds to wait for the last message of a stream
+LOOKED_AT = 2.0  # seconds for the listening thread to process what has arrived: a node is released within 4 s
+MOST_EARLY = 512  # messages of a stream that are kept until the reply to its Subscribe was processed
 
 
 @dataclass
@@ -56,7 +57,7 @@ class ReceivedStream:
     def __post_init__(self) -> None:
         plan = self.receiver.plan
         self._at_once = plan.span >= GATHER * 1e9
-        # Of a stream that runs free only the first instant of each message is known for certain.
+        # In a free-running stream, only the first instant of each message is certain.
         self._last_instant = 0 if plan.subscribe.kind == StreamKind.FREE else plan.span - plan.subscribe.period
         self._test_pattern = plan.subscribe.test_pattern
 
@@ -165,7 +166,7 @@ class HearingThread:
         self._port = port
         self._streams: dict[tuple[int, int], ReceivedStream] = {}
         self._early: dict[tuple[int, int], EarlyMessages] = {}
-        self._new: deque[ReceivedStream] = deque()  # registered, and not looked at yet
+        self._new: deque[ReceivedStream] = deque()  # registered, and not processed yet
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._looks = 0
@@ -206,7 +207,7 @@ class HearingThread:
                 time.sleep(0.002)
 
         wait(time.monotonic() + HEARD_OUT)
-        looks = self._looks  # the look that goes on may have begun before the last message came
+        looks = self._looks  # the pass in progress may have begun before the last message arrived
         wait(time.monotonic() + LOOKED_AT, lambda: self._looks > looks + 1 or not self._is_hearing)
         heard.finish()
 
@@ -236,18 +237,19 @@ class HearingThread:
             try:
                 self._hear()
             except LinkError as failure:
-                # The nodes' own threads meet the same failure, report it, and open the link again.
+                # The threads of the nodes get the same failure, report it, and open the link again.
                 self.failure = failure
                 self._stop.wait(0.5)
 
     def _hear(self) -> None:
         """Hear until the thread is to end; raises LinkError."""
-        waiting = {id(heard): heard for heard in self._streams.values()}  # may hold messages that are not handed on yet
+        # streams that may hold messages that were not passed on yet
+        waiting = {id(heard): heard for heard in self._streams.values()}
         with self._port.listen() as listener:
             self.failure = None
             looked = time.monotonic()
             while not self._stop.is_set():
-                # All that wait first: a thread that fell behind calibrates more at once, and catches up.
+                # Get all that is queued: a thread that fell behind then calibrates larger blocks and catches up.
                 came = listener.get_all(SLICE)
                 touched = {(message.node, message.stream): self._dispatch(message) for message in came}
                 for heard in touched.values():
@@ -263,7 +265,8 @@ class HearingThread:
 
     def _dispatch(self, message: DataMessage) -> ReceivedStream | None:
         key = (message.node, message.stream)
-        early = self._early.get(key)  # first: one that is registered meanwhile is found below, and takes what waits
+        # read first: a stream registered after this line is found below, and takes the early messages
+        early = self._early.get(key)
         heard = self._streams.get(key)
         if heard is not None:
             heard.queue_message(message.octets, message.at)

@@ -33,8 +33,8 @@ from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 
 DRIVE_ABOVE = 50  # set points a second
-WATCHED = 10  # set points over which their rate is taken
-ECHO = 255  # number of the "stream" in which applied set points are echoed; nodes have 0 to 3
+WATCHED = 10  # set points over which their rate is computed
+ECHO = 255  # number of the "stream" for the echo of applied set points; nodes use 0 to 3
 
 
 @dataclass
@@ -45,7 +45,7 @@ class _Actuator:
     count: int = 0
     came: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED))
     driver: Driver | None = None
-    drivable: bool = True  # whether the node takes Drive messages for it, as far as is known
+    drivable: bool = True  # False once the node has refused Drive messages for it
 
     @property
     def fast(self) -> bool:
@@ -80,8 +80,8 @@ class TopicActuators:
         self._newest: dict[int, SetPointCommand] = {}
         self._news = threading.Condition()
         self._stop = False
-        self._last_drive = 0  # its run
-        self._unsure = False  # whether a value may still be on its way
+        self._last_drive = 0  # run of the last Drive messages
+        self._unsure = False  # True if a value may still be on its way
         self.refused = 0
         self._thread = threading.Thread(target=self._run, name=f"actuators {trusted.uuid[:8]}", daemon=True)
         self._thread.start()
@@ -153,7 +153,7 @@ class TopicActuators:
         fast_alone = actuator.fast and sum(actuator.claimed_until > now for actuator in self._actuators.values()) <= 1
         if not fast_alone:
             actuator.driver = None
-        # A Drive message has no reply, so now and then a value goes by command: a node that was cut off is noticed.
+        # Drive messages have no reply, so now and then send a value by command: a node that was cut off is noticed.
         by_message = fast_alone and now - actuator.answered < self._dead_man / 2000
         if not (by_message and self._is_driven(command, actuator, octets)):
             self._set(command, actuator, octets)
@@ -167,7 +167,7 @@ class TopicActuators:
             actuator.claimed_until = 0.0
             if refusal.reason != Reason.WRONG_STATE:
                 raise
-            # Its dead-man has run out meanwhile, by the node's clock: the way back is a new Operate.
+            # By the node's clock, the dead-man has expired meanwhile: claim the channel again with Operate.
             self._claim(command.channel, actuator)
             self._write(command, octets)
         except LinkError:
@@ -183,7 +183,7 @@ class TopicActuators:
         try:
             claim(self._verified, number, lease=LEASE, dead_man=self._dead_man)
         except NodeRefusedError as refusal:
-            if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
+            if refusal.reason != Reason.WRONG_STATE:  # this session still has the claim
                 raise
 
     def _is_driven(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> bool:
@@ -195,7 +195,7 @@ class TopicActuators:
         except (NodeRefusedError, NotAuthenticError, GarbledError) as error:
             if not (
                 isinstance(error, NodeRefusedError) and error.reason == Reason.WRONG_STATE
-            ):  # its claim is gone: _set
+            ):  # the claim is gone; _set claims it again
                 actuator.drivable = False
                 self._notify(f"channel {command.channel} takes no Drive messages: {error.message}")
             return False

@@ -29,7 +29,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.profile import ChannelProfile
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
-# From a signed datasheet to the facts that go with every value.
+# From a signed datasheet to the facts that accompany every value.
 
 _WORDS: dict[ChannelKind, Kind] = {
     ChannelKind.SENSOR: "sensor",
@@ -80,8 +80,9 @@ def _if_finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-LEASE, LONGEST_LEASE = 10, 60  # seconds that a claim holds without a word of this station
-LEASE_EACH = 0.2  # seconds of lease for each node of the bus, so that asking all for their clocks stays below a tenth
+LEASE, LONGEST_LEASE = 10, 60  # seconds for which a claim lasts without a message from this station
+# seconds of lease for each node of the bus: clock requests to all nodes then use below a tenth of the time
+LEASE_EACH = 0.2
 DEAD_MAN = 1000  # milliseconds without a set point after which an actuator is safe
 
 
@@ -119,11 +120,11 @@ class VerifiedSession:
     def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
         """Return the facts for every value of a channel that gives one every ``period`` seconds."""
         siblings = tuple((channel.number, channel.name) for channel in self.sheet.channels)
-        if self.unsigned:  # a name to distinguish channels; none of the node's other claims is repeated
+        if self.unsigned:  # the name only distinguishes channels; no other unsigned claim is used
             kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
             bare = ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
             return replace(bare, siblings=siblings)
-        if self.unverified:  # its own name: the store's name is for a signed datasheet
+        if self.unverified:  # the name from its TEDS: the store's name belongs to a signed datasheet
             known = facts_of(self.sheet, channel, name=self.sheet.meta.name, fingerprint="", period=period)
             return replace(known, siblings=siblings, unverified=True)
         known = facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
@@ -160,7 +161,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
     if looked.verified.verdict != "unsigned":
         require_authentic(looked.verified)
     image = looked.image
-    if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start proves nothing
+    if looked.kept:  # an unsigned Security TEDS has no digests of the other TEDS, so a cached copy proves nothing
         c, image = node.open_counter, read_image(node)
         verified = keep(
             station, node, image, by=by, floor=freshness_floor_of(station, node.uuid, node.proven), c=c

@@ -168,7 +168,7 @@ class _ZeroRun:
             step.detail = f"zero offset {channel.show(found.offset, difference=True)}"
         if self.dry_run:
             return replace(found, steps=tuple(self.steps.done))
-        if not node.tapped:  # a tap ends the claims of others by itself
+        if not node.tapped:  # a tap ends the claims of other stations
             require_not_measured(station, node, released=self.visit.released)
             _require_nobody_else(trusted)
         return self._bring(wanted_image, found)

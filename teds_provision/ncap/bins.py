@@ -14,10 +14,10 @@ from typing import Any, Final, cast
 
 from teds_provision.arrays import NDArray, np
 
-_LATE: Final = 2.0  # seconds by which samples may come behind others; more, and the clock was put back
-_MOST_FEW: Final = 1500  # bins; so many take as much memory as two thirds of a ring of 6,000
-_TIDY: Final = 32  # bins between two looks at those that are too old
-_FARTHEST: Final = 3e38  # distance of two values that a bin can hold
+_LATE: Final = 2.0  # seconds by which samples may arrive late; beyond that, the clock was set back
+_MOST_FEW: Final = 1500  # bins; so many need two thirds of the memory of a ring with 6,000
+_TIDY: Final = 32  # bins between two removals of old ones
+_FARTHEST: Final = 3e38  # largest distance between two values of a bin
 _REAL, _BITS = struct.Struct("<f"), struct.Struct("<I")
 
 
@@ -27,7 +27,7 @@ class SegmentedBins:
     def __init__(self, width: float, size: int) -> None:
         self.width, self.size = width, size
         self.newest = -1
-        self._starts: list[tuple[int, int]] = []  # first bin and number of each segment, both ascending
+        self._starts: list[tuple[int, int]] = []  # (first bin, segment), ascending in both
 
     def _forget(self, first: int, last: int) -> None:
         """Empty the bins from ``first`` to ``last``."""
@@ -36,7 +36,7 @@ class SegmentedBins:
     def _reach(self, number: int, segment: int) -> bool:
         """Make room for bin ``number``, the next that is written; False if it is too old to be kept."""
         if self.newest >= 0 and number < self.newest - _LATE / self.width:
-            self._forget(number, self.newest)  # the clock was put back: that time is overwritten
+            self._forget(number, self.newest)  # the clock was set back: overwrite that time
             self.newest = number - 1
         if not self._starts or self._starts[-1][1] != segment or self._starts[-1][0] > number:
             self._extend_to(number, segment)
@@ -52,7 +52,7 @@ class SegmentedBins:
             self._forget(first, own - 1)
         oldest = self.newest - self.size + 1
         kept = [start for start in self._starts if start[0] < first and start[1] != segment]
-        gone = sum(start <= oldest for start, _ in kept[1:])  # segments without a bin in the ring
+        gone = sum(start <= oldest for start, _ in kept[1:])  # segments whose bins have all left the ring
         self._starts = [*kept[gone:], (first, segment)]
 
     @property
@@ -79,14 +79,14 @@ class Bins(SegmentedBins):
         counts = np.uint8 if coarse else np.uint16
         self._low = np.full(size, np.nan, np.float32)
         self._high = np.zeros(size, np.uint16) if coarse else np.full(size, np.nan, np.float32)
-        # samples, invalid, lost; what never happened takes no memory
+        # Samples, invalid, lost; the last two are allocated only when first needed.
         self._counts: list[NDArray[Any] | None] = [np.zeros(size, counts), *([None] * (1 if coarse else 2))]
         self._type, self._most = counts, int(np.iinfo(counts).max)
         low, high = cast("Any", self._low), cast("Any", self._high)
         self._lows, self._highs = (
             cast("Any", memoryview(low)),
             cast("Any", memoryview(high)),
-        )  # for single numbers: a tenth
+        )  # single numbers: a tenth of the time of indexing arrays
 
     def add_one(self, number: int, value: float, invalid: int, lost: int, segment: int) -> None:
         """Take in one sample of a segment; ``value`` is NaN if there is none, ``invalid`` 1 if it is not valid."""

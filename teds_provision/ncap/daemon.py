@@ -142,7 +142,7 @@ class Daemon:
         self.watches = [self._watch(with_source(place, source)) for place in settings.places]
         self._observer = threading.Thread(target=self._observe, name="store", daemon=True)
 
-    # -- its life ----------------------------------------------------------------------------------------------------
+    # -- start, run, end ---------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
@@ -257,7 +257,7 @@ class Daemon:
                 self.live.event("store", state="newer", why=newer.message, hint=newer.hint)
                 self._ends()
                 return
-            except StoreError as failure:  # what is read next may be right again
+            except StoreError as failure:  # temporary: the next read may succeed
                 _log.warning("The store cannot be read: %s", failure.message)
 
     def _look_at_vault(self) -> None:
@@ -298,7 +298,7 @@ class Daemon:
         """Do what was requested for this node, or take it up; False if there was nothing to do."""
         before = node.identity.state
         served = self.node_jobs.serve(node) or self.adopting.serve(node)
-        if served or node.identity.state != before:  # what a measurement refused it for may be gone
+        if served or node.identity.state != before:  # the reason why a measurement refused it may be gone
             self.measuring.look_who_is_meant()
         return served
 
@@ -306,7 +306,7 @@ class Daemon:
     def _adopts(self) -> bool:
         return self.settings.adopt and self.detection == "transparent"
 
-    # -- what the API asks -------------------------------------------------------------------------------------------
+    # -- for the API -------------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, Any]:
         """Return the object of api.md, `/status`."""
@@ -505,7 +505,7 @@ class Daemon:
         Raises NotFoundError, FrozenError (it is measured), NodeBusyError (it is worked on).
         """
         with self.node_locks.hold(uuid, "it is removed"):
-            with self.station.lock("virtual"):  # no measurement begins with it meanwhile
+            with self.station.lock("virtual"):  # so that no measurement starts with it meanwhile
                 if self.measuring.measurement_of(uuid) is not None:
                     raise FrozenError(f"Node {uuid} is being measured.", hint="End the measurement first.")
                 one = self.virtuals.forget(uuid)

@@ -30,11 +30,12 @@ from teds_provision.teds.codec.model import Units
 
 HOUR, MINUTE = 3600, 60
 FINE: Final = 0.01  # seconds of a bin of the last minute
-_WAITING = 4096  # blocks that wait to be taken in; a thread that brings more takes them in itself
+_WAITING = 4096  # blocks in the queue; a thread that adds more processes them itself
 _EVERY = 0.5  # seconds
-_FEW: Final = 8  # instants of a block that are taken in one by one: numpy's calls cost more than so many samples
-_SLOW: Final = 25.0  # instants a second at most whose bins of the last minute stay few
-_EDGE: Final = 1e-6  # of a bin: a moment so short before an edge counts as behind it, as 0.01 is no binary fraction
+_FEW: Final = 8  # blocks of at most so many instants are added one by one, which is faster than numpy's calls
+_SLOW: Final = 25.0  # up to so many instants a second, only a few bins of the last minute are allocated
+# of a bin: a moment so close before an edge counts as after it, since 0.01 is not a binary fraction
+_EDGE: Final = 1e-6
 
 Key = tuple[str, int]
 
@@ -46,9 +47,9 @@ class _Meaning:
     unit: str = ""
     units: Units | None = None
     calibration: Calibration | None = None
-    turn: tuple[float | None, float | None] | None = None  # limits between which its values wrap
+    turn: tuple[float | None, float | None] | None = None  # the limits between which its values wrap
     unsigned: bool = False
-    raw: bool = False  # it has no values: raw numbers are kept
+    raw: bool = False  # it has no values, so raw numbers are stored
 
     @classmethod
     def from_facts(cls, facts: ChannelFacts, *, raw: bool = False) -> _Meaning:
@@ -192,7 +193,8 @@ class History:
         known = self._streams.get(key)
         lost = max(0, block.index - known.expected) if known is not None and known.run == run else 0
         self._streams[key] = _Stream(run, block.index + len(block.time))
-        # What a slow channel sent during a pause comes as one block: a ring for the minute would stay for ever.
+        # A slow channel sends what it kept during a pause as one block; _put_many would allocate a ring for it
+        # permanently.
         if len(block.time) <= _FEW or len(block.time) - 1 <= _SLOW * float(block.time[-1] - block.time[0]):
             self._put_few(block, lost)
         else:
@@ -232,7 +234,7 @@ class History:
                 counts = np.stack([total, invalid[:, column], gone])
                 one.ring(fine=fine).add(numbers, low[:, column], high[:, column], counts, one.segment)
 
-    # -- what is asked -----------------------------------------------------------------------------------------------
+    # -- queries -----------------------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         """Return the number of channels with a history."""

@@ -26,11 +26,11 @@ from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
 
 BEAT: Final = 0.05  # seconds between two messages of values
-POINTS: Final = 100.0  # a second and channel, at most
-_CREDIT: Final = 20.0  # points that a channel may be behind: samples come in bursts
-_WAITING: Final = 512  # blocks between two beats; beyond that the oldest go
-_EVENTS: Final = 256  # events that a client may leave unread
-_TOLD: Final = 0.5  # seconds between two signs of life
+POINTS: Final = 100.0  # most points a second and channel
+_CREDIT: Final = 20.0  # points that a channel may save up, since samples come in bursts
+_WAITING: Final = 512  # blocks between two beats; if there are more, the oldest are dropped
+_EVENTS: Final = 256  # events that may be queued for a client
+_TOLD: Final = 0.5  # seconds between two keep-alive messages
 
 Key = tuple[str, int]
 
@@ -94,7 +94,7 @@ class _Channel:
     credit: float = _CREDIT
     times: list[NDArray[Any]] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
-    before: float = math.nan  # value of the last point that was given out
+    before: float = math.nan  # value of the last point that was sent
 
 
 class Live:
@@ -110,7 +110,7 @@ class Live:
         self._channels: dict[Key, _Channel] = {}
         self._last: dict[Key, LastValue] = {}
         self._turning: frozenset[Key] = frozenset()
-        self._raw: frozenset[Key] = frozenset()  # channels without calibration: their raw numbers are given out
+        self._raw: frozenset[Key] = frozenset()  # channels without calibration: their raw numbers are sent
         self._listeners: set[LiveClient] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.overrun = 0
@@ -154,7 +154,7 @@ class Live:
         """Return the newest value of a channel."""
         return self._last.get((uuid, channel))
 
-    # -- in the loop -------------------------------------------------------------------------------------------------
+    # -- in the event loop -------------------------------------------------------------------------------------------
 
     def join(self, *, reader: bool = False) -> LiveClient:
         """Add a client."""

@@ -69,14 +69,15 @@ _RUN: Final = "run"
 _OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
 """IDs of measurements that options of ``ncap run`` began: they end with it."""
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order
-ANSWERING: Final = 1.0  # seconds for a node that has another address now
-LONGEST_END: Final = 20.0  # the same, for who waits as long as it takes
-_BEGINNING: Final = 0.2  # seconds between two looks whether a measurement that takes its nodes has begun
-LONGEST_LOOK: Final = 120.0  # seconds that another look at a node may take
-LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
-_SLOW_LOOK: Final = 0.5  # seconds between looks at a measurement whose nodes are listed
-_SELECTING: Final = 1.0  # seconds between looks for the nodes of a frozen expression
-_ENDING, _LONGEST_ENDING = 15.0, 20.0  # seconds for a measurement to end in order, and that its caller waits
+ANSWERING: Final = 1.0  # seconds for the answer of a node whose address has changed
+LONGEST_END: Final = 20.0  # seconds for the same, for callers that can wait
+_BEGINNING: Final = 0.2  # seconds between checks whether a measurement that holds the node's lock has begun
+LONGEST_LOOK: Final = 120.0  # seconds that another inspection of a node may take
+# seconds after which a lent node is measured again, even if the borrower has not returned it
+LONGEST_LOAN: Final = 900.0
+_SLOW_LOOK: Final = 0.5  # seconds between checks of a measurement whose nodes are listed
+_SELECTING: Final = 1.0  # seconds between selections of nodes for a frozen expression
+_ENDING, _LONGEST_ENDING = 15.0, 20.0  # seconds for a measurement to end in order, and for its caller to wait
 
 
 @dataclass(eq=False)
@@ -117,7 +118,7 @@ class MeasurementSupervisor:
         self._dead_man = dead_man
         self._running: dict[str, RunningMeasurement] = {}
         self._loans: dict[str, list[NodeLoan]] = {}
-        self._moving: set[str] = set()  # nodes that are being let go, or measured again
+        self._moving: set[str] = set()  # nodes whose loan is beginning or ending
         self._lock = threading.Condition()
         self._wake = threading.Event()
         self._thread: threading.Thread | None = None
@@ -126,7 +127,7 @@ class MeasurementSupervisor:
         self._messages: tuple[float, int] = (time.monotonic(), 0)
         self._rate = 0.0
 
-    # -- its life ----------------------------------------------------------------------------------------------------
+    # -- start and end -----------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Carry on what is kept."""
@@ -144,7 +145,7 @@ class MeasurementSupervisor:
             (measurement.match, measurement.rate, measurement.frozen) == same
             for measurement in self._station.measurements.due()
         ):
-            return  # it is kept already
+            return  # already stored
         kept = KeptMeasurement(_RUN, match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man)
         self._log(self._begin(kept), "begun")
 
@@ -200,7 +201,7 @@ class MeasurementSupervisor:
             self._log(running, "ended" if running.kept.id in _OF_THIS_PROCESS else "paused")
         self._workers.shutdown(wait=False, cancel_futures=True)
 
-    # -- what the API asks -------------------------------------------------------------------------------------------
+    # -- for the API -------------------------------------------------------------------------------------------------
 
     def add(self, members: Mapping[str, Any], owner: str = NCAP) -> dict[str, Any]:
         """Measure from now on, after every restart too, until it is deleted; ``owner`` is who asked for it.
@@ -223,10 +224,11 @@ class MeasurementSupervisor:
         whole = replace(
             spec,
             sinks=tuple(dict.fromkeys(self._sinks.whole(sink) for sink in spec.sinks)),
-            actuators=spec.actuators and spec.match is None,  # actuators are never claimed for nodes as they come
+            # an expression also matches nodes that come later, whose actuators must not be claimed
+            actuators=spec.actuators and spec.match is None,
         )
         kept = KeptMeasurement("", **whole.settings(), owner=owner)
-        # What can never be measured is refused before it is kept: it would be tried for ever, after each restart too.
+        # Refuse what can never be measured before it is stored: it would be retried for ever, also after each restart.
         nodes = self._station.measurements.nodes_of(kept)
         if not nodes and kept.match is None:
             raise UsageError(f"Group {kept.group!r} is empty.", hint="Add a node to it first.")
@@ -235,10 +237,10 @@ class MeasurementSupervisor:
             self._require_plan(uuid, kept)
         for sink in kept.sinks:
             self._sinks.open(sink)
-        with self._station.lock("measure"):  # of two requests at once for one node, or its group, one is refused
+        with self._station.lock("measure"):  # if two requests at once name one node or group, one of them is refused
             for uuid in self._station.measurements.nodes_of(kept):
                 self._require_unmeasured(uuid)
-                self._require_plan(uuid, kept)  # it may have been removed meanwhile
+                self._require_plan(uuid, kept)  # the node may have been removed meanwhile
             with self._station.durable("measure"):
                 kept = self._station.measurements.keep(kept)
                 facts = facts_for_log(kept)
@@ -291,7 +293,7 @@ class MeasurementSupervisor:
         kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
         channels = Sheet.from_image(image).channels
         if self._sinks.allows_set_points(kept) and channels and all(channel.actuator for channel in channels):
-            return  # it has nothing to measure; set points come for it
+            return  # it has only actuators, which need no plan for samples
         for channel in sensors_of(channels, kept.channels, kind):
             period_of(channel, kept.rate)
 
@@ -391,7 +393,7 @@ class MeasurementSupervisor:
         with measurement.session(bytes.fromhex(uuid), streaming=streaming) as trusted:
             yield trusted
 
-    # -- nodes that a command of this home writes to -----------------------------------------------------------------
+    # -- lending nodes to commands of this home that write to them ---------------------------------------------------
 
     def lend_node(self, loan: NodeLoan, seconds: float = LETTING_GO) -> bool:
         """Release a node until :meth:`return_node`, so that a writer can use it; False if it is not measured.
@@ -410,7 +412,7 @@ class MeasurementSupervisor:
                         hint="End the measurement first.",
                     )
                 self._loans.setdefault(loan.uuid, []).append(loan)
-                if job is None:  # and none begins meanwhile
+                if job is None:  # within the lock, so that no measurement starts meanwhile
                     return False
             if job.suspend_node(bytes.fromhex(loan.uuid), loan.why, seconds):
                 return True
@@ -457,7 +459,7 @@ class MeasurementSupervisor:
                 try:
                     self._node_locks.acquire(uuid, why, wait=LONGEST_LOOK)
                     mine.callback(self._node_locks.release, uuid)
-                except FrozenError:  # its measurement keeps the lock for the time of the loan, or is about to begin
+                except FrozenError:  # its measurement keeps the lock during the loan, or is about to start
                     if not was_measured and time.monotonic() >= until:
                         raise
                     if not was_measured:
@@ -482,7 +484,7 @@ class MeasurementSupervisor:
                 job = self._job_of(loan.uuid)
             if job is not None:
                 job.resume_node(bytes.fromhex(loan.uuid))
-                self.look_who_is_meant()  # a beginning forgets that it was to end, renamed by its borrower, say
+                self.look_who_is_meant()  # select again: the borrower may have renamed the node, for example
                 return
         if self._directory.seen(loan.uuid).present:
             self.on_sighting(loan.uuid)
@@ -557,7 +559,7 @@ class MeasurementSupervisor:
         with suppress(StoreError):
             self._station.audit("measure", node, outcome, **running.log_facts(), **counts)
 
-    # -- the thread that decides --------------------------------------------------------------------------------------
+    # -- the supervising thread ---------------------------------------------------------------------------------------
 
     def _begin(self, kept: KeptMeasurement) -> RunningMeasurement:
         running = RunningMeasurement(kept, self._listed(kept), kept, looked=time.monotonic())
@@ -583,7 +585,7 @@ class MeasurementSupervisor:
                     self._look_at(running, time.monotonic())
                 except TedsProvisionError as error:
                     if isinstance(error, StoreError) and running.phase is Phase.MEASURING:
-                        # What is read at the next look may be right again.
+                        # Temporary: the next read may succeed.
                         _log.warning("Measurement %s: the store cannot be read: %s", running.kept.id, error.message)
                         running.not_before = time.monotonic() + self._waits.store
                     else:
@@ -652,7 +654,7 @@ class MeasurementSupervisor:
             self._lock_members(running, now)
             return
         self._publish_state(running, "waiting", why or "no known node matches")
-        with self._lock:  # those that it had before
+        with self._lock:  # the members of the selection before
             running.membership.members.clear()
             running.reports.clear()
 
@@ -720,17 +722,17 @@ class MeasurementSupervisor:
 
     def _has_other_members(self, running: RunningMeasurement, job: MeasurementJob) -> bool:
         """Return True if `replace` or `decommission` changed the nodes of a measurement in the store."""
-        if running.kept.frozen:  # no other node joins or leaves
+        if running.kept.frozen:  # a frozen measurement gets no other nodes; one of its own may be retired
             return any(self._is_retired(uuid) for uuid in running.uuids)
         kept = next((kept for kept in self._station.measurements.all() if kept.id == running.kept.id), None)
-        if kept is None:  # deleted by `decommission`, unless it came to its end
+        if kept is None:  # `decommission` deleted the row, unless the measurement's time was over
             return job.kept.ends is None and not running.stop.is_set()
         try:
             return {uuid.hex() for uuid in self._station.measurements.nodes_of(kept)} != set(running.uuids)
         except NotFoundError:
             return True
 
-    # -- its end -----------------------------------------------------------------------------------------------------
+    # -- the end of a measurement ------------------------------------------------------------------------------------
 
     def _end(self, running: RunningMeasurement) -> None:
         """Begin to end it in order; :meth:`_finish` follows when its threads have ended, or 15 s later."""
@@ -770,14 +772,14 @@ class MeasurementSupervisor:
         if running.job is not None and not running.failed:
             self._publish_state(running, "ended")
         by_itself = running.state == "ended" and not running.takes_in and not running.stop.is_set()
-        if by_itself:  # its time is over, and its row is gone
+        if by_itself:  # its time is over, and its row was deleted
             self._log(running, "ended")
         self._leave_table(running, still_shown=not by_itself)
 
     def _take_new_members(self, running: RunningMeasurement) -> bool:
         """Read again which nodes a measurement has; False if it is not kept any more, because none is left."""
         try:
-            kept = running.asked  # of a frozen expression the nodes are looked for again
+            kept = running.asked  # the nodes of a frozen expression are selected again
             if kept.match is not None:
                 running.kept, running.phase, running.looked = kept, Phase.SELECTING, -_SELECTING
                 return True
@@ -815,7 +817,7 @@ class MeasurementSupervisor:
             running.state, running.why = state, why
             self._live.event("measurement", state=state, id=running.kept.id, group=running.kept.group, why=why)
 
-    # -- nodes as they come ------------------------------------------------------------------------------------------
+    # -- nodes that come and go --------------------------------------------------------------------------------------
 
     def _who(self, kept: KeptMeasurement) -> NodeMatch | UnsignedNodes | ListedNodes:
         if self._unverified is not None and kept.id in (UnsignedNodes.text, _ADOPTED):
@@ -860,7 +862,7 @@ class MeasurementSupervisor:
             return
         try:
             self._node_locks.acquire(uuid, f"measurement {running.kept.id}", wait=0.0, frozen=True)
-        except TedsProvisionError:  # it is looked at, or provisioned: it joins when that is done
+        except TedsProvisionError:  # the node is being inspected or provisioned; it joins when that is done
             with self._lock:
                 membership.elsewhere.discard(uuid)
                 membership.busy[uuid] = time.monotonic() + LOOK
@@ -886,7 +888,7 @@ class MeasurementSupervisor:
         measurement, membership = job.measurement, running.membership
         if measurement is not None and measurement.ready.is_set():
             if measurement is not running.measurement:
-                # It began, or restarted after its sinks had failed: it has no members.
+                # A new Measurement, at the start or after its sinks failed: it has no members yet.
                 for uuid in list(membership.members):
                     self._release(running, uuid)
                 running.measurement = measurement
@@ -920,11 +922,11 @@ class MeasurementSupervisor:
         if not changed or now - running.followed < self._waits.selection:
             return
         running.asked_anew = False
-        running.version, running.followed = None, now  # until it was followed whole
+        running.version, running.followed = None, now  # None until this function completes
         for uuid, member in list(membership.members.items()):
             refused = why_not_measured(self._station, bytes.fromhex(uuid))
             if refused and not running.is_measuring(uuid):
-                continue  # its supervisor is about to find that, and reports it as a refusal
+                continue  # its supervisor will notice the refusal and report it
             why = refused or self._why_not(running, uuid)
             if why and member.supervisor is not None:
                 member.supervisor.stop(why)
@@ -956,9 +958,10 @@ class MeasurementSupervisor:
         unselected = self._why_not(running, uuid)
         if sighting is None or unselected:
             self._release(running, uuid)
-            if unselected:  # since it arrived: it was signed, renamed or banned
+            if unselected:  # it was signed, renamed or banned since it arrived
                 self._forget_report(running, uuid)
-            if sighting is None and uuid in membership.places:  # a session failed there: if it answers there, it joins
+            # a session failed there: ask at that place, and let the node join if it answers
+            if sighting is None and uuid in membership.places:
                 self._workers.submit(self._ask, membership.places[uuid])
             return
         room = self._room_of(uuid)
@@ -969,20 +972,21 @@ class MeasurementSupervisor:
         try:
             what = f"measure {running.who.text if running.who is not None else ''}"
             member.stack.enter_context(self._station.measurements.running([octets], what=what))
-        except PolicyError as error:  # it is being renamed
+        except PolicyError as error:  # the node is being renamed
             self._wait(running, uuid, error.message, None, 1.0)
             return
         with self._lock:
-            lent = uuid in self._loans  # since it arrived
+            lent = uuid in self._loans  # the node may have been lent since it arrived
             if lent:
                 membership.elsewhere.add(uuid)
             else:
                 membership.join(uuid)
-                for other in self._running.values():  # it is measured here: what another one reported is over
+                for other in self._running.values():  # reports of other measurements about it are obsolete now
                     other.past.add(uuid)
                 running.past.discard(uuid)
                 if running.kept.id == UnsignedNodes.text:
-                    self._adopted.add(octets)  # signed later, it is measured on by the other that unverified() begins
+                    # once it is signed, it belongs to the measurement that unverified() began beside this one
+                    self._adopted.add(octets)
         if lent:
             self._release(running, uuid)
             return
@@ -1062,7 +1066,7 @@ class MeasurementSupervisor:
         with suppress(LinkError, KeyError):
             self._buses.bus_of(sighting).discovery.identify_at(sighting.address, ANSWERING)
 
-    # -- what it hears -----------------------------------------------------------------------------------------------
+    # -- callbacks of measurements -----------------------------------------------------------------------------------
 
     def _watcher(self, running: RunningMeasurement) -> Watcher:
         def report(report: NodeReport) -> None:
@@ -1102,7 +1106,8 @@ class MeasurementSupervisor:
         if said.state == "running":
             facts |= {"present": True, "seen": time.time(), "problem": None}
             if before.get("state") != "running":
-                facts |= {"heard": None, "looked": time.time()}  # in a session: what it sent outside one is obsolete
+                # verified in a session, so an earlier unauthenticated reading is obsolete
+                facts |= {"heard": None, "looked": time.time()}
         elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, running):
             facts["problem"] = problem_of(TedsProvisionError(said.why))
         if changed:
@@ -1127,7 +1132,7 @@ class MeasurementSupervisor:
             state = "waiting"
         else:
             return
-        if state == "joined" and report.uuid not in running.logged:  # not each time that it comes back
+        if state == "joined" and report.uuid not in running.logged:  # logged only once, not at each return
             running.logged.add(report.uuid)
             self._log(running, "joined", report.uuid)
         ended = state == "left" and running.stop.is_set()

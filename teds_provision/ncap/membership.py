@@ -18,13 +18,14 @@ from teds_provision.measure.matching import NodeLoad
 from teds_provision.measure.node_supervisor import NodeSupervisor
 from teds_provision.protocol.messages.identity import NodeState
 
-LOOK: Final = 0.1  # seconds between looks at nodes that have gone
-QUIET, GATHERING = 0.05, 0.3  # seconds without another arrival, and at most, in which those that come together gather
-FIRST_ROUND: Final = 3.0  # seconds for all to answer at the beginning, so that all get their fair part
-FIRST_ASK, LAST_ASK = 0.2, 16.0  # seconds until a lost node is asked again, doubling
+LOOK: Final = 0.1  # seconds between checks for nodes that have left
+# nodes that arrive together are gathered until no other one comes for QUIET seconds, at most GATHERING seconds
+QUIET, GATHERING = 0.05, 0.3
+FIRST_ROUND: Final = 3.0  # seconds for all nodes to answer at the start, so that each gets its share of the bus
+FIRST_ASK, LAST_ASK = 0.2, 16.0  # seconds until a lost node is asked again; the interval doubles
 ASKED: Final = 60.0  # seconds for which a lost node is asked
-AGAIN: Final = 30.0  # seconds until one that may not be measured, or has no room, is tried again without other news
-SLOWEST: Final = 50.0  # a node that comes is slowed down so many times at most; then it waits for room
+AGAIN: Final = 30.0  # seconds until a node that may not be measured, or has no room, is tried again
+SLOWEST: Final = 50.0  # largest factor by which a new node's rate is reduced; beyond that it waits for room
 NO_ROOM: Final = "no room on the bus"
 
 
@@ -90,10 +91,10 @@ class Membership:
     arrived: dict[str, float] = field(default_factory=dict)
     busy: dict[str, float] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
-    leaving: set[str] = field(default_factory=set)  # they were in, and their locks are being released
+    leaving: set[str] = field(default_factory=set)  # former members whose locks are being released
     waits: dict[str, _WaitingNode] = field(default_factory=dict)
     lost: dict[str, _LostNode] = field(default_factory=dict)
-    places: dict[str, Sighting] = field(default_factory=dict)  # the last place of each that was measured
+    places: dict[str, Sighting] = field(default_factory=dict)  # the last place of each measured node
 
     def has(self, uuid: str) -> bool:
         """Return True if a node is in."""
@@ -198,7 +199,8 @@ class Membership:
             self.wait(uuid, now + AGAIN, room)
         elif isinstance(error, (NotAuthenticError, PolicyError, BadDataError)):
             self.wait(uuid, now + AGAIN, None)
-            if last is not None and last.identity.state == NodeState.FACTORY:  # the adopter hears it, now it is free
+            # the node's lock is free now, so that it can be adopted when it answers
+            if last is not None and last.identity.state == NodeState.FACTORY:
                 return AfterEnd.ASK
         elif error is not None and seen is not None and seen is not last:
             return AfterEnd.TRY

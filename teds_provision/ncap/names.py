@@ -35,7 +35,7 @@ class Names:
         self._of_running: tuple[StationFacts, int, Topics] | None = None
         self._guard = threading.Lock()
         self._topics: Topics | None = None
-        self._made_of = -1  # the roster's count of changes
+        self._made_of = -1  # the directory's count of changes at that time
 
     def forget(self) -> None:
         """Drop cached names after a chosen name changed. Changes of nodes and datasheets are noticed anyway."""

@@ -36,7 +36,7 @@ class RunningMeasurement:
     kept: KeptMeasurement
     membership: Membership
     asked: KeptMeasurement
-    who: NodeMatch | UnsignedNodes | ListedNodes | None = None  # of one that takes nodes in as they come
+    who: NodeMatch | UnsignedNodes | ListedNodes | None = None  # only for measurements that nodes join as they come
     job: MeasurementJob | None = None
     phase: Phase = Phase.LOCKING
     state: str = "starting"
@@ -46,17 +46,19 @@ class RunningMeasurement:
     logged: set[str] = field(default_factory=set)
     stop: threading.Event = field(default_factory=threading.Event)
     over: threading.Event = field(default_factory=threading.Event)
-    deleted: bool = False  # it ends, and is not shown any more
-    looked: float = 0.0  # when a slow look was taken, or waiting for its nodes began (time.monotonic)
-    until: float = 0.0  # when it is over, ended in order or not
-    selection: Future[tuple[list[bytes], str]] | None = None  # the nodes of a frozen expression are looked for
-    again: bool = False  # it begins again with other nodes
+    deleted: bool = False  # it is ending and is no longer shown
+    looked: float = 0.0  # time.monotonic() of the last slow check, or of the start of waiting for its nodes
+    until: float = 0.0  # latest time of its end, in order or not
+    # the selection of nodes for a frozen expression, in progress
+    selection: Future[tuple[list[bytes], str]] | None = None
+    again: bool = False  # it will start again with other nodes
     failed: str = ""
-    not_before: float = 0.0  # when it is looked at again after the store could not be read
-    # of one that takes nodes in as they come
+    not_before: float = 0.0  # after a failed read of the store: time of the next try
+    # Only for measurements that nodes join as they come.
     budget: Budget = field(default_factory=Budget)
     unknown_type: str = ""
-    measurement: Measurement | None = None  # the one whose members are known: it is another after sinks have failed
+    # the one to which the members belong; a new one is made after sinks have failed
+    measurement: Measurement | None = None
     version: object = None
     followed: float = 0.0
     asked_anew: bool = False

@@ -48,7 +48,7 @@ class DaemonLock:
                 f"A base station is already running for {self._home} (pid {pid or 'unknown'}).",
                 hint="Show it: teds-provision ncap status. Stop it: kill -TERM PID.",
             ) from None
-        with suppress(OSError):  # who holds it is for people; a full disk has its own, better messages
+        with suppress(OSError):  # the pid is only information for users; a full disk is reported elsewhere
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         self._descriptor = descriptor
@@ -77,7 +77,7 @@ def run(station: Station, settings: Settings, on_event: OnEvent, waits: Waits = 
     Raises StoreLockedError if this home has a daemon, LinkError if an address is taken, UsageError.
     """
     require_safe(settings)
-    station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that
+    station.released = lambda _uuid, _command: nullcontext()  # the node locks of this process do this
     with DaemonLock(station.home) as presence, one_core():
         local = presence.listen()
         tcp = listen(*settings.http) if settings.http is not None else None
@@ -103,13 +103,13 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, _ending(stop))
-    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # its terminal was closed; under nohup it is ignored
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # the terminal was closed; under nohup the signal is ignored
         loop.add_signal_handler(signal.SIGHUP, stop.set)
     servers = Servers()
     watchdog = asyncio.create_task(_watchdog())
     app = build(daemon)
     early: list[dict[str, Any]] = []
-    daemon.live.on_event = early.append  # the first line reports that it is ready
+    daemon.live.on_event = early.append  # held back, because the first line must be the one that reports "ready"
 
     async def begin() -> None:
         await servers.serve(Guard(app, daemon.tokens, None), local)

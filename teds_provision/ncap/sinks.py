@@ -57,7 +57,7 @@ class DaemonSinks:
         self._home, self._specs, self.actuators = home, tuple(specs), actuators
         self._record = record.absolute() if record is not None else None
         for spec in self._specs:
-            open_sink(spec)  # a malformed sink is reported at the start, not at the first measurement
+            open_sink(spec)  # reports a malformed sink at the start, not at the first measurement
         started = [spec for spec in self._specs if urlsplit(spec).scheme.startswith("mqtt")]
         self._brokers: dict[str, str] = {STARTED: started[0]} if started else {}
         for name, url in (brokers or {}).items():

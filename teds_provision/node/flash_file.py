@@ -42,7 +42,7 @@ class FlashFile:
         self._delay = delay
         self._lock: int | None = None
         if exclusive and folder.is_dir():
-            self._hold()  # before anything is read: what another process wrote last must not be undone
+            self._hold()  # before reading, so that the last write of another process is not undone
         self._document = self._read()
 
     @classmethod
@@ -259,5 +259,5 @@ def _replace(path: Path, document: dict[str, Any]) -> None:
     with whole_file(path, replace=True) as file:
         file.write(octets)
         file.seek(0)
-        if file.read() != octets:  # what is not there does not take the place of the old state
+        if file.read() != octets:  # the old file is replaced only by octets that were read back
             raise OSError(errno.EIO, "the flash does not read back as it was written", str(path))

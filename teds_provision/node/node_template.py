@@ -95,6 +95,6 @@ def create(
     blocks = None
     if described is not None:
         blocks = described.with_uuid(wanted).blocks
-        Board(Sheet.from_image(Image(wanted, blocks)))  # what it could not imitate is reported now, not when it runs
+        Board(Sheet.from_image(Image(wanted, blocks)))  # reports now, not at run time, what a board cannot imitate
     read_only = frozenset({ORIGIN}) if sensor is not None else frozenset[BlockId]()
     return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks, read_only=read_only)

@@ -63,7 +63,7 @@ class RealtimeLoop:
             try:
                 wait = node.beat()
             except LinkError:
-                wait = None  # the reading thread of that bus meets the same failure, and its sessions end
+                wait = None  # the reading thread of that bus gets the same failure and ends its sessions
             except Exception:
                 logging.getLogger(__name__).exception("A node's measuring failed.")
                 wait = None
@@ -77,7 +77,7 @@ class RealtimeLoop:
         with self._condition:
             while not self._stopped:
                 while self._heap and self._due.get(self._heap[0][2]) != self._heap[0][1]:
-                    heapq.heappop(self._heap)  # woken or called meanwhile
+                    heapq.heappop(self._heap)  # an old entry: the node was woken or called meanwhile
                 wait = self._heap[0][0] - time.monotonic() if self._heap else None
                 if wait is not None and wait <= 0:
                     node = heapq.heappop(self._heap)[2]

@@ -189,7 +189,7 @@ class VirtualNode:
         if slots is not None:
             slots.start()
             if slots.behaves("crash") and slots.on_trial:
-                slots.start()  # the watchdog, and the boot loader reverts it
+                slots.start()  # the watchdog restarts it, and the boot loader reverts the image
             if slots.behaves("confirm"):
                 slots.confirm()
             self._off = slots.behaves("mute")
@@ -252,12 +252,12 @@ class VirtualNode:
         """Have a link called after each restart: its conversations are over."""
         self._restarted.append(restarted)
 
-    # -- what links call -------------------------------------------------------------------------------------------
+    # -- called by links -------------------------------------------------------------------------------------------
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         """Run one command frame; see NodeHandler."""
         reply = self.request_received(link, frame, tapped=tapped, received=self.tick())
-        if self.tim.restarts_after(link):  # a reader takes the reply by itself: nothing reports that it has left
+        if self.tim.restarts_after(link):  # over NFC, nothing reports that the reader has fetched the reply
             timer = threading.Timer(_READER_SECONDS, self.reply_sent, (link,))
             timer.daemon = True
             timer.start()
@@ -283,7 +283,7 @@ class VirtualNode:
             port = port_of(link)._replace(fd=fd, mtu=mtu, hears=hears)
             reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=at)
         with self._wire:
-            pass  # a data frame that was on its way out is out: nothing of a stream leaves behind the reply to Stop
+            pass  # wait for a data frame that is being sent: no frame of a stream may follow the reply to Stop
         self._wake()
         return reply
 
@@ -339,11 +339,11 @@ class VirtualNode:
         """Return the present tick, or that of ``at`` (see MeasuringHandler); 0 for a node without clock."""
         if self.board is None:
             return 0
-        # A simulation's clock does not advance between its lines: a moment ago it was the same tick.
+        # A simulation's clock advances only with its lines, so its tick does not depend on the time passed.
         passed = time.monotonic() - at if at and self.board.clock.runs_by_itself else 0.0
         return max(0, self.board.clock.tick() - max(0, round(passed * 1e9)))
 
-    # -- its own life ----------------------------------------------------------------------------------------------
+    # -- by hand, and over time ------------------------------------------------------------------------------------
 
     def in_factory_state(self) -> bool:
         """Return True if the node holds no key."""
@@ -352,7 +352,7 @@ class VirtualNode:
     def reset_by_hand(self) -> None:
         """Hold the button 5 s."""
         if self.manager is not None and self.manager.on_trial:
-            self.restart()  # an image on trial changes nothing that is stored
+            self.restart()  # an image on trial must not change stored state
         with self._core.command():
             self.tim.reset_by_hand()
 
@@ -379,12 +379,12 @@ class VirtualNode:
             if wait is not None:
                 for channel, tick, reading in board.events():
                     self.tim.event(channel, tick, reading.octets, valid=reading.valid)
-        if wait is None:  # no stream runs any more
+        if wait is None:  # no stream is running
             self._report_missed(board)
             return None
         frame = self._send_frames()
         self._report_missed(board)
-        wait = max(wait, board.lag / NANOSECONDS / 2)  # what lags is sampled a few instants at a time
+        wait = max(wait, board.lag / NANOSECONDS / 2)  # a lagging board is sampled in batches of a few instants
         wait = min(max(wait, _COARSE), _EVENTS if board.has_events else wait + _COARSE)
         return wait if frame is None else min(frame, wait)
 
@@ -446,7 +446,7 @@ class VirtualNode:
         if self._realtime_loop is not None and self.board is not None:
             self._realtime_loop.wake(self)
 
-    # -- slow parts ------------------------------------------------------------------------------------------------
+    # -- background work -------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
         """Wait as long as the board needs for one operation on the curve."""

@@ -30,7 +30,7 @@ class WorkerPool:
         self._lock = threading.Lock()
         self._work: SimpleQueue[Job | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
-        self._free = 0  # threads without a job, less the jobs that wait for one
+        self._free = 0  # idle threads minus queued jobs
         self._ended = False
 
     def new_queue(self) -> JobQueue:
@@ -102,4 +102,4 @@ class JobQueue:
             self._busy = bool(self._jobs)
             more = self._busy
         if more:
-            self._run_soon(self._run)  # one job at a time, so that no link keeps a thread
+            self._run_soon(self._run)  # one job at a time, so that no link occupies a thread for long

@@ -88,7 +88,8 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
     for roster in sorted(read.values(), key=lambda roster: (roster.version, roster.hash)):
         own = station.plant.roster
         how, why = taking(roster, own, registry)
-        at = now() if own is None else max(now(), own.created)  # the roster here shows a clock that was put back
+        # the roster's date shows if this machine's clock was set back
+        at = now() if own is None else max(now(), own.created)
         if how not in ("same", "older") and roster.created > at + MOST_AHEAD:
             how, why = "refused", "it is dated in the future: check this machine's clock"
         if how in ("same", "older") and (how == "same" or roster.hash in known):
@@ -101,7 +102,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
         if "two rosters" in how:
             alarm(station, "two-rosters", "", roster.version, why)
     held = station.plant.roster
-    if held is not None:  # the next version is the cure
+    if held is not None:  # a newer version ends the conflict
         for raised in station.plant.alarms.all():
             if raised.code == "two-rosters" and raised.n < held.version and not raised.seen:
                 station.plant.alarms.end(raised)
@@ -113,7 +114,7 @@ def put_roster(station: Station, roster: Roster) -> None:
     before = station.plant.roster
     with station.transaction():
         station.plant.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, utc_now()))
-        for member in roster.members:  # so that it can be handed keys without the CA key being here
+        for member in roster.members:  # so that keys can be handed over to the member, although the CA key is not here
             station.identity.keep_certificate(station.ca, member.point, member.certificate)
         station.audit("registry", None, "roster", version=roster.version, hash=roster.hash)
         for station_id, chain in station.plant.pages.chains().items():
@@ -141,7 +142,8 @@ def take_pages(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
             station.plant.pages.put_heads(chain.id, page.heads)
         fresh = recount(station, chain, roster)
         for page in pages:
-            if (page.number, page.hash) not in fresh:  # on no branch that counts; what it bans is banned all the same
+            # the page is on no branch that counts, but its bans are applied anyway
+            if (page.number, page.hash) not in fresh:
                 _keep_bans(station, chain, page.events, counts=False)
 
 
@@ -269,7 +271,7 @@ def octets_of(row: PageRow) -> bytes:
     return join(row.header, row.content, row.signature)
 
 
-# -- what follows for each node ----------------------------------------------------------------------------------------
+# -- what follows for each node: bans, pins, conflicts -----------------------------------------------------------------
 
 
 class _LocalRows(NamedTuple):
@@ -322,7 +324,7 @@ def _judged(
     for uuid, hash, page_of, counts, text in station.plant.claims.bans_of(uuids):
         try:
             read = open_revocation(text, lambda kid: roster.point_of(kid) or station.policy.station_points().get(kid))
-        except TedsProvisionError:  # of an unknown signer, or not what it seems: it bans nothing
+        except TedsProvisionError:  # an unknown signer or a malformed statement: no ban
             continue
         if read.uuid == uuid:
             said.setdefault(uuid, []).append(BanStatement(hash, page_of, counts, read))

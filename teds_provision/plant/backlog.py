@@ -43,7 +43,7 @@ def backlog(station: Station) -> Iterator[PastEvent]:
     for ban in station.policy.revocations():
         try:
             own = open_revocation(ban.statement, lambda kid: station.point if kid == station.fingerprint else None)
-        except TedsProvisionError:  # another station's statement: it reports that itself
+        except TedsProvisionError:  # another station's statement, which that station publishes itself
             continue
         yield "revoked", ban.uuid, {"statement": own.statement}
 

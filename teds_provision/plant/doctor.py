@@ -16,7 +16,7 @@ from teds_provision.station.store.sqlite import has_store
 if TYPE_CHECKING:
     from teds_provision.protocol.plant import roster as rosters
     from teds_provision.protocol.plant.roster import Roster
-else:  # cryptography: only for a station that joined a registry
+else:  # imports cryptography: only for a station that joined a registry
     rosters = late("teds_provision.protocol.plant.roster")
 
 _SYNC = "teds-provision registry sync"

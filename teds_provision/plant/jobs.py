@@ -97,7 +97,7 @@ def take_received(station: Station) -> None:
         try:
             take_job(station, octets)
         except RosterExpiredError:
-            return  # nothing begins now; a renewed roster decides
+            return  # keep the jobs until a renewed roster decides
         except (BadDataError, NotAuthenticError, PolicyError) as error:
             station.notice(f"A received job was rejected: {error.message}")
         with station.durable("job"):

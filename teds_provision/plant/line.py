@@ -125,7 +125,7 @@ class LineRun:
         """Return True if the job names this very board: that is a keeper's confirmation of it."""
         return self.is_listed(who.uuid) and self.job is not None and self.job.boards[who.uuid] == who.fingerprint
 
-    # -- what a board gets -----------------------------------------------------------------------------------------
+    # -- the order for a board -------------------------------------------------------------------------------------
 
     def order(self, who: IdentifiedNode) -> PreparedOrder:
         """Return what this board gets; raises PolicyError (not in the job, its calibration), KeyMismatchError."""
@@ -136,7 +136,7 @@ class LineRun:
             return self._with_digest(
                 self.order_of_all.calibration, who.uuid, lambda: prepare(self.station, self.order_of_all, who.uuid)
             )
-        self._require_open()  # the last board of a long night may come after its end
+        self._require_open()  # the job may have ended since the run began
         if job.boards:
             listed = job.boards.get(who.uuid)
             if listed is None:

@@ -48,7 +48,7 @@ def found_roster(station: Station, transport: Transport, octets: bytes | None) -
     """
     found = [] if octets is None else [open_roster(octets, station.ca)]
     held = station.plant.roster
-    if held is not None:  # it belongs already, and changes what carries
+    if held is not None:  # the station is a member already, and changes its transport
         found.append(held)
     for roster_octets in transport.rosters() if octets is None else ():
         try:
@@ -158,8 +158,8 @@ def branch(station: Station, of: str, hash: str | None, transport: Transport | N
     roster = require_roster(station)
     chain: Chain = station.plant.pages.chain(of)
     links = station.plant.pages.chain_links(chain.id)
-    partings = [chain.counted[0] + 1]  # the one that is undecided
-    if chain.accepted is not None:  # and the one that was decided, which a person may decide differently
+    partings = [chain.counted[0] + 1]  # the undecided fork
+    if chain.accepted is not None:  # and the decided fork, whose choice can be changed
         partings.append(counting(links, last=None, accepted=None).two or 0)
     by_number = {n: sorted({hash for number, hash, _ in links if number == n}) for n in partings}
     n = next((n for n in partings if len(by_number[n]) > 1 and _among(by_number[n], hash)), 0)

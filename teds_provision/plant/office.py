@@ -121,7 +121,7 @@ def answer_all(
             return
         try:
             sealed = answer(station, come.document, jobs)
-        except RequestAheadError as ahead:  # it stays where it is until its time has come
+        except RequestAheadError as ahead:  # left in the inbox until its time has come
             station.notice(f"Not signed: {ahead.message}")
             continue
         if sealed is not None:
@@ -161,9 +161,9 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
     image = _built(station, job, request)
     with station.durable("signer"):
         meanwhile = station.plant.line.sign_request(request.hash, "in")
-        if meanwhile is not None and meanwhile.answer is not None:  # another `signer` was faster
+        if meanwhile is not None and meanwhile.answer is not None:  # another `signer` process was faster
             return meanwhile.answer
-        row = _require_room(station, job, request)  # again: another signer may have taken the last unit
+        row = _require_room(station, job, request)  # check again: another signer may have taken the last unit
         station.plant.line.put_unit(row)
         if station.pins.entry(request.uuid) is None:
             station.pins.put(WhitelistEntry(request.uuid, fingerprint(request.point), assurance="uuid"))
@@ -229,7 +229,8 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
         return UnitRow(job.id, request.uuid, greatest + 1, utc_now())
     answers = sum(row.sequence is not None for row in line.sign_requests(job.id, request.uuid, "in"))
     if station.identity.fingerprint not in job.stations:
-        answers = max(answers, kept.attempts)  # pages told a home that a backup rebuilt; it has no requests of since
+        # after a restore from a backup, the pages have the count; the requests since then are not stored here
+        answers = max(answers, kept.attempts)
     if answers >= MOST_ANSWERS:
         raise _RefusedError("full", f"the unit already has {MOST_ANSWERS} answers")
     return replace(kept, attempts=answers + 1)
@@ -315,7 +316,7 @@ def _profile(station: Station, job: Job) -> Profile:
     seen = path.stat()
     state = seen.st_mtime_ns, seen.st_ino, seen.st_size
     profile = _loaded(str(path), state, int(time.monotonic()), station.home)
-    require_profile(station, job, path)  # it may have changed while it was read
+    require_profile(station, job, path)  # the file may have changed while it was read
     return profile
 
 

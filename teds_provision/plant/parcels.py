@@ -50,7 +50,7 @@ Views = Callable[[Sequence[bytes]], Mapping[bytes, MergedClaims]]
 """The plant's view of some nodes, by UUID."""
 
 
-# -- in ----------------------------------------------------------------------------------------------------------------
+# -- incoming ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -316,7 +316,7 @@ def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]
     return [(row, parcels.document(row.id, "in")) for row in parcels.all("in", "waiting") if row.kind == kind]
 
 
-# -- out ---------------------------------------------------------------------------------------------------------------
+# -- outgoing ----------------------------------------------------------------------------------------------------------
 
 
 def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> str:
@@ -374,11 +374,11 @@ def _send(station: Station, roster: Roster, transport: Transport) -> int:
     parcels, sent = station.plant.parcels, 0
     for row in parcels.all("out", "ready"):
         if roster.member(row.peer) is None:
-            continue  # a removed station gets nothing; a move to it is a person's to take back
+            continue  # nothing is sent to a removed station; taking back a move to it is the operator's decision
         try:
             transport.send(Parcel(row.id, row.peer, parcels.document(row.id, "out"), row.expires, station.fingerprint))
         except PolicyError:
-            break  # too much waits there: the rest goes with the next sync
+            break  # the receiver's queue is full: the rest goes with the next sync
         with station.durable(_COMMAND):
             if row.kind == "bundle":
                 parcels.set_state(row.id, "out", "sent")
@@ -434,7 +434,8 @@ def _make_copies(station: Station, roster: Roster, views: Views, now: datetime) 
         assert member is not None
         to = TrustRecord(member.name, "station", member.point, receiver)
         with station.lock(_COMMAND):
-            for part in (clear, disputed):  # what is in dispute waits for a person there, and holds up nothing else
+            # apart, since disputed nodes wait for the receiver's operator and must not delay the others
+            for part in (clear, disputed):
                 for plan in outgoing.plan_copies(station, to, part, now, most=NODES) if part else ():
                     send_export(station, plan, now)
 
@@ -448,7 +449,7 @@ def _due(
     clear: list[bytes] = []
     disputed: list[bytes] = []
     own = _with_views(views, parcels.unshared(receiver))
-    gone = quiet or roster.removed  # else the maker of a key shares it
+    gone = quiet or roster.removed  # otherwise the station that made the key shares it
     others = _with_views(views, parcels.unshared(receiver, imported=True)) if gone else iter(())
     mine = (other for other in others if sharing.sharer(roster, other[3], (other[1], other[2]), quiet) == me)
     for uuid, _, _, view in chain(own, mine):

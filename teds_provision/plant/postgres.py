@@ -50,9 +50,10 @@ _GRACE: Final = 5.0
 _CHANNEL: Final = "teds"
 _FROM_URL: Final = frozenset({"host", "hostaddr", "port", "dbname", "sslrootcert", "sslcrl", "sslcrldir"})
 _NO_SCHEMA: Final = frozenset({"42P01", "3F000", "42883", "42703"})  # no such table, schema, function, column
-# The server's words, as libpq has no SQLSTATE before a login; in another language they are passed on as they are.
+# The server's messages, because libpq has no SQLSTATE before a login; messages in other languages are passed on as they
+# are.
 _LOGIN_REFUSED: Final = ("is not permitted to log in", "password authentication failed")
-_RETURNING: Final = 2  # the first schema that has `found`
+_RETURNING: Final = 2  # the first schema that has the table `found`
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ union all select 'page', p.station, p.n, p.jws, null, null from registry.page p
 _LOOK: Final = f"""{_LOOK_1}
 union all select 'handed', author, pages, at::text, by, null from registry.handed"""
 
-# Every page of an author, from any sender: the author itself (by null), or others.
+# Every page of an author, by its sender: null for the author itself, otherwise another station.
 _OFFERS: Final = """\
 select n, encode(hash, 'hex'), encode(sha256(convert_to(jws, 'UTF8')), 'hex'), null::text
   from registry.page where station = %s
@@ -114,7 +115,8 @@ select id::text, document, expires, sender from registry.parcel
   where recipient = registry.me() and octet_length(document) <= %s and id <> all(%s::uuid[])
   order by received limit %s"""
 
-# Rights of a member's login in a database whose schema was not run by a superuser, or undone by pg_restore.
+# Rights that a member's login has in a database whose schema was not run by a superuser, or that pg_restore brought
+# back.
 _OPEN_DOORS: Final = """\
 select what from (values
   ('TEMP for PUBLIC', has_database_privilege(current_database(), 'TEMP')),
@@ -170,7 +172,7 @@ def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
         "ssl_min_protocol_version": "TLSv1.3",
         "channel_binding": "require",
         "gssencmode": "disable",
-        "target_session_attrs": "read-write",  # a standby that lags shows less than there is
+        "target_session_attrs": "read-write",  # a standby that lags behind does not have all rows
         "connect_timeout": CONNECTING,
         "tcp_user_timeout": CONNECTING * 1000,
         "keepalives_idle": 10,
@@ -222,7 +224,7 @@ class Registry:
         """Return everything that shows whether anything is new, in one round trip."""
         try:
             rows = self._rows(_LOOK, ())
-        except _NoSchemaError:  # of an older schema, or a newer one that has other tables, or none
+        except _NoSchemaError:  # the schema is older, newer with other tables, or missing
             rows = self._rows("select 'meta', null, version from registry.meta", ())
             if rows and rows[0][2] < _RETURNING:
                 rows = self._rows(_LOOK_1, ())

@@ -212,7 +212,7 @@ def _first_removals(station: Station) -> dict[str, datetime]:
 def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
     try:
         return frozenset(removed.fingerprint for removed in open_roster(octets, ca).removed)
-    except TedsProvisionError:  # kept as proof of two of one version
+    except TedsProvisionError:  # stored only as proof that there were two rosters of one version
         return frozenset()
 
 

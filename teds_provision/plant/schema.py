@@ -37,7 +37,7 @@ def registry_sql(registry: str, removed: Iterable[str] = ()) -> str:
     Running it again is harmless, and the remedy after a pg_restore.
     """
     text = (files("teds_provision.plant") / "registry.sql").read_text(encoding="utf-8")
-    quiet = "set client_min_messages = warning;\n"  # run again, each table that is there would be a notice
+    quiet = "set client_min_messages = warning;\n"  # on a second run, each existing table would cause a notice
     return quiet + text.replace(":'registry'", f"'{UUID(registry)}'") + "".join(map(close_sql, removed))
 
 

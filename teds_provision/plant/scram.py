@@ -13,7 +13,7 @@ from base64 import b64encode
 from typing import Final
 
 SECRET_OCTETS: Final = 32
-_ITERATIONS: Final = 4096  # what PostgreSQL itself takes; with 256 random bits more of them protect nothing
+_ITERATIONS: Final = 4096  # PostgreSQL's own number; with 256 random bits, more iterations protect nothing
 _SALT_LABEL: Final = b"TEDS1 registry salt"
 _VERIFIER = re.compile(r"SCRAM-SHA-256\$4096:[A-Za-z0-9+/]{22}==\$[A-Za-z0-9+/]{43}=:[A-Za-z0-9+/]{43}=")
 

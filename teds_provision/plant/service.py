@@ -180,7 +180,7 @@ class PlantWatch:
         """Return the object of api.md, `/jobs`."""
         found = []
         for row in self._station.plant.line.jobs():
-            with suppress(NotAuthenticError):  # of a keeper that no roster names any more
+            with suppress(NotAuthenticError):  # by a keeper that is in no roster any more
                 found.append(self._job(plant.jobs.kept_job(self._station, row), row.state))
         return found
 
@@ -285,10 +285,10 @@ class PlantWatch:
                     if self._listener is None:
                         return
                 self._listener.listen()
-                self._wake.set()  # for what was pushed before it
+                self._wake.set()  # finds what was pushed before
                 swept = 0.0
                 while not self._stop.is_set():
-                    if time.monotonic() - swept >= EVERY:  # also finds out whether the connection is there
+                    if time.monotonic() - swept >= EVERY:  # also detects a lost connection
                         self._listener.sweep()
                         swept = time.monotonic()
                     if self._listener.wait(EVERY):

@@ -80,7 +80,7 @@ class OfficeSilentError(UnprovenError):
     code = "no-answer"
 
 
-# -- the post: documents of a line, each sealed for its receiver -------------------------------------------------------
+# -- the transport: documents of a line, each sealed for its receiver --------------------------------------------------
 
 
 def transport_for(station: Station, folder: Path | None) -> Transport:
@@ -144,13 +144,14 @@ class Inbox:
 
     def _drop(self, parcel: str, drop: Callable[[str, Any], object], of: str) -> None:
         drop(parcel, of)
-        self._known.discard(parcel)  # the same request, asked again, is the same parcel
+        self._known.discard(parcel)  # a repeated request has the same parcel ID
 
     def wait(self, seconds: float, pause: float) -> None:
         """Wait until a database notifies of a parcel, ``seconds`` at most; ``pause`` without notifications."""
         if self._hears:
             try:
-                if self._listener is None:  # what came before it listens, nobody says: look at once
+                # parcels that arrived before the first listen cause no notification: look at once
+                if self._listener is None:
                     self._listener = connecting.listener(self._station)
                     if self._listener is not None:
                         self._listener.listen()
@@ -158,7 +159,8 @@ class Inbox:
                 else:
                     self._listener.wait(seconds, parcel_to=self._station.identity.fingerprint)
                     return
-            except LinkError:  # the station has no connection left, or the server goes: a look shows it
+            # the station has no connection left, or the server is shutting down: the next look shows this
+            except LinkError:
                 self.close()
             self._hears = False
         time.sleep(min(seconds, pause))
@@ -208,7 +210,7 @@ def send_job(station: Station, transport: Transport, job: Job) -> None:
         )
 
 
-# -- asking ------------------------------------------------------------------------------------------------------------
+# -- making requests ---------------------------------------------------------------------------------------------------
 
 
 class Office(Protocol):

@@ -138,7 +138,7 @@ def _rosters(station: Station, transport: Transport, done: SyncResult) -> list[t
         )
     results = take_rosters(station, transport.rosters())
     for roster, how, why in results:
-        if how not in ("taken", "older"):  # each member posts the newest that it knows: some are behind
+        if how not in ("taken", "older"):  # "older" is normal: members post the newest roster that they know
             done.remarks.append(f"roster {roster.version}: {how}: {why}")
     held = station.plant.held_roster()
     if held is not None:
@@ -159,7 +159,7 @@ def _parcels(station: Station, transport: Transport, roster: Roster, done: SyncR
     done.parcels_out = parcels.send_out(station, transport, seen, at)
 
 
-# -- one's own chain ---------------------------------------------------------------------------------------------------
+# -- this station's chain ----------------------------------------------------------------------------------------------
 
 
 def own_chain(station: Station) -> Chain:
@@ -194,7 +194,8 @@ def _check_own_chain(
         _require_all_seen(station, roster, {page.number for page in found})
         if new or connected or joined.url is None:
             station.plant.end_restored()
-        else:  # a stick that knows less than this home's joined state shows nothing: it would repeat a number
+        # a folder that has fewer pages than this home acknowledged proves nothing: a page number could be used twice
+        else:
             done.remarks.append(
                 "this home was restored from a backup and publishes nothing new until it has synced with its"
                 " own registry"
@@ -288,7 +289,8 @@ def _know_again(station: Station, page: Page) -> None:
     signed: set[bytes] = set()
     for event_read in map(event.read, page.events):
         if isinstance(event_read, event.Event) and event_read.act == "firmware" and event_read.uuid is not None:
-            station.firmware_reports.make_hint(event_read.uuid)  # of the backup: this station saw a newer one since
+            # the report is from the backup; this station has seen a newer one since
+            station.firmware_reports.make_hint(event_read.uuid)
         if (
             isinstance(event_read, event.Event)
             and event_read.uuid is not None
@@ -311,9 +313,9 @@ def _know_again(station: Station, page: Page) -> None:
         node = station.nodes.get(uuid)
         if node is not None:
             station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
-        elif uuid in signed:  # no sequence is used twice, whether the board is known here or not
+        elif uuid in signed:  # keep the sequence of an unknown board too, so that none is used twice
             station.nodes.remember(uuid, sequence=sequence)
-    # Pin boards that this station signed for under the key that it said itself: no other board gets their units.
+    # Pin boards that this station signed for to the key in its own claims, so that no other board gets their units.
     for uuid, text in station.plant.claims.of_station(own_chain(station).id, sorted(signed)).items():
         pin = Claim.from_json(text).pin
         if pin is not None and station.pins.entry(uuid) is None:
@@ -394,7 +396,7 @@ def unknown_pages(station: Station, transport: Transport) -> list[Page]:
 
 
 def _under_our_key(station: Station, transport: Transport, roster: Roster) -> list[Page]:
-    transport.registry()  # a database is checked again
+    transport.registry()  # raises if the database was replaced meanwhile
     found, _ = fetching.read_pages(transport.pages(station.fingerprint, 0), roster, station.fingerprint)
     return found + returned.own_pages(station, transport.returned, roster, {page.hash for page in found}, always=True)
 
@@ -472,7 +474,7 @@ def _push(station: Station, transport: Transport, roster: Roster, done: SyncResu
             done.pushed += own
     joined, newest = station.plant.joined, own_chain(station).counted[0]
     assert joined is not None
-    # to a station that uses folders each of them is the registry: a stick has another path on each machine
+    # For a station that uses folders, each of them is the registry: a removable disk has another path on each machine.
     by_folder = transport.everybody and (joined.url or "").startswith(FILES)
     if (connected or by_folder) and joined.acknowledged != newest:
         station.plant.put_record(replace(joined, acknowledged=newest))

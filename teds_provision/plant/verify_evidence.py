@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from teds_provision.protocol.plant import roster as rosters
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.provisioning import whitelist
-else:  # a list of pins brings the store along, a roster the signed documents: nothing else here needs them
+else:  # a list of pins needs the store, a roster needs the signed documents; nothing else here does
     document, rosters = late("teds_provision.protocol.plant.document"), late("teds_provision.protocol.plant.roster")
     whitelist = late("teds_provision.provisioning.whitelist")
 
@@ -88,7 +88,7 @@ def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
     try:
         shown = security.decode(evidence.teds)
     except BadDataError:
-        return  # reported already
+        return  # reported elsewhere
     signer = fingerprint(shown.station_key) if shown.station_key is not None else ""
     if signer != station:
         yield from _gone(roster, signer, "the station that signed the datasheet")
@@ -204,7 +204,7 @@ def verify_evidence(
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, min(at + _CHUNK, len(files)))) for at in range(0, len(files), _CHUNK))
         return
-    yield work.judge(range(1))  # what is loaded late is there before there are more processes
+    yield work.judge(range(1))  # loads the late modules before the fork
     size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
     ranges = [range(at, min(at + size, len(files))) for at in range(1, len(files), size)]
     yield from map_ranges(work.judge, ranges, workers)

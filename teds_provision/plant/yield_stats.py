@@ -178,7 +178,7 @@ def to_csv(station: Station, attempts: Iterable[Attempt]) -> str:
     writer.writerow([*COLUMNS, *steps])
     for attempt in attempts:
         name = roster.name_of(attempt.station) if roster is not None else ""
-        name = f"'{name}" if name[:1] in ("=", "+", "-", "@") else name  # a sheet would take it for a formula
+        name = f"'{name}" if name[:1] in ("=", "+", "-", "@") else name  # a spreadsheet would evaluate it as a formula
         seconds = "" if attempt.steps is None else f"{sum(attempt.steps.values()):.3f}"
         verdict = "passed" if attempt.code is None else "failed"
         row = [

@@ -192,4 +192,4 @@ class AddressClaim:
             address = (own - 1 + step) % LAST_ADDRESS + 1
             if address not in self._heard:
                 return address
-        return own  # every address is taken: nothing is better than here
+        return own  # every address is in use, so keep the own one

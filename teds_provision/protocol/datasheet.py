@@ -128,7 +128,7 @@ def meta_names(teds: bytes, uuid: bytes) -> bool:
             return True
         width = block[5] if len(block) > 5 else 1
         if width == 1 and block[6:18] == _UUID_HEAD + uuid:
-            return True  # it is the first field wherever this program writes it
+            return True  # always the first field in TEDS of this program
         return any(part.type == UUID_FIELD and part.value == uuid for part in frame.tuples(block, width=width or 1))
     except BadDataError:
         return False

@@ -103,7 +103,7 @@ def normalise_signature(raw: bytes) -> bytes:
     return raw[:32] + min(s, GROUP_ORDER - s).to_bytes(32, "big")
 
 
-@lru_cache(maxsize=256)  # stations, CAs and the node at hand are asked for again and again, and a check costs 25 µs
+@lru_cache(maxsize=256)  # stations, CAs and the present node recur, and a check takes 25 µs
 def public_key(point: bytes) -> ec.EllipticCurvePublicKey:
     """Read a 65-octet point strictly: uncompressed, on the curve, not infinity. Raises BadDataError."""
     return _load_key(point)
@@ -208,7 +208,7 @@ def _uncompressed(key: ec.EllipticCurvePublicKey) -> bytes:
     return key.public_bytes(serialization.Encoding.X962, serialization.PublicFormat.UncompressedPoint)
 
 
-# Labelled messages of the profile. Labels of signatures end in 00.
+# Messages of the profile that begin with a label. Labels of signatures end in 00.
 
 
 @lru_cache(maxsize=256)

@@ -56,7 +56,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
         if not _is_at(node, address):
             raise
     if node.contact.address is not None:
-        node.forget()  # a link is one pair of addresses: this session ended with the old one
+        node.forget()  # a link is one pair of addresses, so the session ended with the old one
     elif node.sealed and read_identity(node).can_address != address:
         raise GarbledError("The node accepted the new CAN address but still reports the old one.")
     with station.durable("address"):

@@ -101,7 +101,7 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
             station.audit("key", uuid, "epoch corrected", key_id=record.key_id, said=record.epoch, epoch=identity.epoch)
             record = station.keys.correct_epoch(record, identity.epoch)
         station.pins.settled(uuid)
-        # what is signed without the node is for this epoch
+        # Signatures made without the node need its present epoch.
         station.nodes.remember(
             uuid, epoch=record.epoch, **({} if identity is None else {"sequence": identity.sequence})
         )
@@ -122,7 +122,7 @@ def _activate(station: Station, record: KeyRecord) -> None:
     uuid = record.uuid
     station.keys.promote(uuid, record.key_id)
     if record.state == "pending" and record.source == "agreement":
-        # a pending key out of a backup may have been used and shared since (model/README.md, OLD_PENDING)
+        # A pending key from a backup may have been used and shared since (model/README.md, OLD_PENDING).
         if not station.keys.restored(uuid):
             station.keys.rotated(uuid)
         pinned = station.pins.pinned(uuid)
@@ -200,7 +200,7 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     offered = node.identity.epoch
     if offered <= held:
         return ""
-    how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify cannot distinguish them
+    how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify does not show which
     hint = f"it reports key epoch {offered}, after {held} here: {how}"
     octets = _shown_security(node)
     try:
@@ -308,7 +308,8 @@ def _agree(
     again: bool,
 ) -> AgreeResult:
     new = who.state == NodeState.FACTORY
-    if not new and newcomer is None and station.pins.entry(node.uuid) is None:  # to whitelist it would be of no use
+    # another owner's node: whitelisting would not help
+    if not new and newcomer is None and station.pins.entry(node.uuid) is None:
         require_own_ca(station, node.uuid, who.state, who.security_teds)
     with station.reading():
         returning = _may_return(station, who)
@@ -316,10 +317,10 @@ def _agree(
         if entry is None or station.pins.entry(node.uuid) is not None:
             entry = station.policy.require_whitelisted(node.uuid, returning=returning)
     demanded = rotate and not again
-    # of a run that was just cut short the node may have the new key, whatever it reported before
+    # After a run that was just cut, the node may have the new key, even if it reported factory state before.
     held = open_session(station, node, word=rotate) if not new or again else None
     if held is not None:
-        if newcomer is not None:  # a session under a key of ours is open: it comes onto the list at once
+        if newcomer is not None:  # the session proves the node, so whitelist it at once
             with station.durable("agree"):
                 _enlist(station, newcomer)
         if demanded or station.keys.rotates_now(node.uuid):
@@ -381,11 +382,11 @@ def _new_key(
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
-        # outside a session the result of the identification counts: on this link, a moment ago
+        # Without a session, the Security TEDS read during identification counts: on this link, just now.
         teds = read_block(node, SECURITY) if node.sealed or who.recalled else who.security_teds
         return _agree_anew(station, node, pinned, ca, teds, returning=returning, only_new=new and not demanded)
     except NodeRefusedError as refusal:
-        # Identify may have been answered while the node was still storing the key of a run that was cut off
+        # The node may have answered Identify while it was still storing the key of a run that was cut.
         late = refusal.reason == Reason.NOT_PERMITTED and new and not demanded
         held = open_session(station, node) if late else None
         if held is None:
@@ -452,9 +453,7 @@ def _agree_anew(
     uuid = node.uuid
     try:
         agreed = _request(station, node, entry, ca, teds)
-    except (
-        TranscriptMismatchError
-    ):  # the TEDS has changed since it was read, or the reply was disturbed: once more, then no
+    except TranscriptMismatchError:  # the TEDS changed since it was read, or the reply was disturbed: try once more
         again = read_block(node, SECURITY)
         if fit_to_agree(again, uuid, entry.fingerprint).node_key != fit_to_agree(teds, uuid, None).node_key:
             raise NotAuthenticError(
@@ -479,7 +478,7 @@ def _agree_anew(
     node.forget()
     node.open(agreed.key, statics=(station.point, agreed.node))
     identity = read_identity(node)
-    if identity.epoch != agreed.epoch:  # a datasheet for the one would never fit the other
+    if identity.epoch != agreed.epoch:  # the node would refuse a datasheet for the other epoch
         raise NotAuthenticError(
             f"The node offered key epoch {agreed.epoch} but reports {identity.epoch} in its session.",
             hint="Its firmware counts epochs incorrectly; node check shows the rule.",
@@ -506,9 +505,7 @@ def _agree_anew(
             station.pins.settled(uuid)
             station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
 
-    station.run_in_background(
-        record
-    )  # the pending key opens a session as well: nothing that is read next depends on it
+    station.run_in_background(record)  # the pending key also opens sessions, so the next reads need not wait for this
     return AgreeResult(agreed.epoch, key_id, fresh=True, listed=True)
 
 
@@ -518,7 +515,7 @@ def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: by
     agreement = StationAgreement(station.identity.credentials(ca), node.uuid)
     reply = node.request_retry_once(
         agreement.request(), "the key agreement"
-    )  # it is in RAM only, and is dropped at the next one
+    )  # the node keeps the agreement in RAM until the next Request
     with station.reading():
         epoch = station.pins.epoch_to_exceed(node.uuid, entry.fingerprint)
     return agreement.accept(reply, teds, pinned=entry.fingerprint, epoch=epoch)
@@ -565,7 +562,7 @@ def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
     command = security_command(Function.RESET, challenge)
     try:
         proof = node.request(command, "the reset")
-    except SessionLostError:  # its reply was lost and the session with it: in factory state it gives the proof again
+    except SessionLostError:  # the reply and the session were lost; in factory state the node sends the proof again
         node.forget()
         proof = node.request_plain(command, "the proof of its reset")
     node.forget()
@@ -602,7 +599,7 @@ def agree_at(
     uuid = station.nodes.resolve(node)
     try:
         station.policy.require_whitelisted(uuid)
-    except NotWhitelistedError:  # if another owner's CA refuses a take-over, to whitelist the node is of no use
+    except NotWhitelistedError:  # another owner's CA may refuse the take-over, and then whitelisting would not help
         if dry_run or not rotate:
             raise
     if dry_run:

@@ -148,9 +148,9 @@ class BatchRun:
         if self.prepared.order.name is not None and self.node is not None:
             named_for(station, self.node, self.prepared)
         self.progress = _progress(station, request, order)
-        self.expected = 0  # how many boards of a bus are worked on, once they were found
+        self.expected = 0  # number of boards on a bus to work on, once found
         taps = self.progress is not None and not request.watch and not request.everyone
-        self.stop = IdleStop(links.timeout if taps else None)  # what is on a bus is found once: no board is waited for
+        self.stop = IdleStop(links.timeout if taps else None)  # a bus is searched once, without waiting for boards
         self._all_done = False
         self._early: EarlyReading | None = None
         self._turn = threading.Lock()
@@ -331,7 +331,7 @@ class BatchRun:
             yield from self._side_by_side(port, contacts, operator)
             if not self.stop.is_asked:
                 self._all_done = True
-                refuse_duplicate_uuids(everyone)  # the others are done, and what is not done is not passed over
+                refuse_duplicate_uuids(everyone)  # after the others, so that a conflict does not stop the finished part
 
     def _at_once(self, port: Port) -> int:
         """Return how many boards are worked on at a time: as many as the bus and the token bear."""
@@ -387,7 +387,7 @@ class BatchRun:
         locked: VaultLockedError | None = None
         try:
             for done in work.results():
-                if isinstance(done.error, VaultLockedError):  # ends the command, after the boards that are finished
+                if isinstance(done.error, VaultLockedError):  # ends the command after the boards in progress
                     locked = done.error
                 else:
                     board = done.result()
@@ -399,7 +399,7 @@ class BatchRun:
                     work.drop_waiting()
             if locked is not None:
                 raise locked
-        except BaseException:  # Ctrl-C: a mute node would be waited for, a minute long
+        except BaseException:  # Ctrl-C: without this, a silent node would delay the end by up to a minute
             work.drop_waiting()
             port.close()
             work.wait(_LEAVING_SECONDS)
@@ -457,7 +457,7 @@ class BatchRun:
                 node.early = None if self._early is None else self._early.answers_of(contact)
                 done = self._provision(node, operator, reporter)
             error = self._lacks_calibration(uuid, done.image)
-        except VaultLockedError:  # of the whole command, and of no board
+        except VaultLockedError:  # concerns the whole command, not one board
             raise
         except TedsProvisionError as failure:
             error = failure
@@ -480,14 +480,14 @@ class BatchRun:
             with self._station.node_lock(uuid):
                 require_session(self._station, node)
                 looked = verify_in_session(self._station, node, by="provision")
-        except (PolicyError, NotAuthenticError):  # provisioning says what is wrong
+        except (PolicyError, NotAuthenticError):  # provisioning will report the reason
             return False
         if looked.verified.verdict != "authentic":
             return False
         self._station.notice(f"Nothing to do: node {uuid.hex()} is authentic, as its datasheet was signed elsewhere.")
         return self._lacks_calibration(uuid, looked.image) is None
 
-    # -- both ------------------------------------------------------------------------------------------------------
+    # -- for one and many ------------------------------------------------------------------------------------------
 
     def _lacks_calibration(self, uuid: bytes, image: Image) -> PolicyError | None:
         """Return an error if the datasheet is authentic but the board's type requires a calibration, else None."""

@@ -106,7 +106,7 @@ class BatchTotals:
         if not self.failed and not self.skipped:
             return None
         text = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
-        if isinstance(self.worst, NoNodeError):  # told nowhere else: no board came whose error it would be
+        if isinstance(self.worst, NoNodeError):  # no board arrived, so no row reports this error
             text = f"{text} {self.worst.message}"
         kind = type(self.worst) if self.worst is not None else PolicyError
         known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyError
@@ -132,7 +132,7 @@ MAX_SHEET_OCTETS: Final = 4 << 20
 MAX_ROWS: Final = 10_000
 COLUMNS: Final = ("uuid", "name", "profile", "calibration", "item", "fingerprint")
 _SHOWN: Final = 20
-_DELIMITERS: Final = ",;\t"  # of equals the first
+_DELIMITERS: Final = ",;\t"  # if two are equally frequent, the first one counts
 _UUID = re.compile("[0-9a-f]{20}")
 _FINGERPRINT = re.compile("[0-9a-f]{32,64}")
 
@@ -327,7 +327,7 @@ class _SheetReader:
             channel=channel,
             item=values.get("item") or self.order.item,
         )
-        shared = replace(order, name=None)  # one fit for all that name the same file
+        shared = replace(order, name=None)  # calculate a calibration only once for all rows that name the same file
         if shared not in self._prepared:
             try:
                 self._prepared[shared] = prepare(self.station, shared)
@@ -409,13 +409,13 @@ class Progress:
         for row in self.sheet.rows:
             if row.number not in matched and moved.get(row.digest):
                 matched[row.number] = left.pop(moved[row.digest].pop(0))
-        for row in self.sheet.rows:  # a row with other cells replaces the one that had its number
+        for row in self.sheet.rows:  # a changed row replaces the one with its number
             yield row, matched[row.number] if row.number in matched else left.get(str(row.number))
 
     def _attempted(self, row: SheetRow, kept: Any) -> RowOutcome:
         try:
             found = RowOutcome(**kept)
-        except TypeError:  # no row yet, or of another version of this tool
+        except TypeError:  # no outcome yet, or one of another version of this program
             return RowOutcome(row.digest, row.content)
         if found.digest != row.digest:
             again = "the sheet changed" if found.result == "passed" else ""
@@ -428,7 +428,7 @@ class Progress:
 
     def _why_again(self, row: SheetRow, found: RowOutcome) -> str:
         """Return why a row that has passed is done once more, "" if it stays done."""
-        if found.content is None:  # finished by an older version, which kept no digests
+        if found.content is None:  # an older version of this program, which stored no digests
             same = found.uuid is not None and self._has_it(row, bytes.fromhex(found.uuid))
             return "" if same else "the datasheet differs from the one that the sheet gives"
         changed = [what for what, digest in row.content.items() if found.content.get(what) != digest]
@@ -466,7 +466,7 @@ class Progress:
         place = self._path.with_suffix(".lock")
         descriptor = open_lock(place)
         try:
-            lock(descriptor, wait=True)  # held for one small file
+            lock(descriptor, wait=True)  # waits: the lock is held only while a small file is written
             yield
         finally:
             os.close(descriptor)
@@ -553,7 +553,7 @@ class Progress:
     def note(self, row: SheetRow, board: BoardResult) -> None:
         """Note how a board ended."""
         attempted = self.rows[row.number]
-        attempted.tries += board.result != "skipped"  # a "no" is no fault of the board
+        attempted.tries += board.result != "skipped"  # a "no" of the operator is not an attempt
         attempted.result = board.result
         attempted.first = attempted.first or (attempted.tries == 1 and board.result == "passed")
         attempted.seconds, attempted.time = round(board.seconds, 3), board.time
@@ -605,7 +605,7 @@ _STYLE: Final = (
     "body{font:16px sans-serif;margin:2em}table{border-collapse:collapse}td,th{border:1px solid #999;padding:.3em .6em;"
     "text-align:left;white-space:nowrap}td:last-child{white-space:normal}"
     ".passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
-    # on paper: A4 lying, the head of the table on each sheet, no board torn in two, colours as on the screen
+    # For printing: A4 landscape, the table's head on each page, no row split between pages, colours as on the screen.
     "@page{size:A4 landscape;margin:12mm}@media print{body{font-size:8pt;margin:0}thead{display:table-header-group}"
     "tr{break-inside:avoid}td,th{padding:.15em .35em}thead th,td:nth-child(4){white-space:normal}"
     "td:nth-child(3),td:last-child{white-space:normal;overflow-wrap:anywhere}"

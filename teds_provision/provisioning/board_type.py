@@ -44,7 +44,7 @@ from teds_provision.teds.units import PRODUCT, name_of_units, units_of
 _LEASE: Final = 5
 _TRIED: Final = 8
 """Sensors that are asked for a valid value, one after the other: a probe may be unplugged."""
-_ROOM: Final = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
+_ROOM: Final = 180  # octets of data sets in one reply, so that it fits the maxMessage of any node
 
 
 class WrongBoardError(PolicyError):
@@ -246,7 +246,7 @@ def shown_by(node: Conversation, channels: Collection[int]) -> dict[BlockId, byt
     return {block: read_block(node, block) for block in wanted}
 
 
-# -- what the hardware bears -----------------------------------------------------------------------------------------
+# -- checking the hardware -------------------------------------------------------------------------------------------
 
 
 def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead_man: int | None = None) -> None:
@@ -318,7 +318,8 @@ def check_hardware(node: Conversation, image: Image, shown: Mapping[int, str] | 
 
 
 def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> HardwareCheck:
-    described = Sheet.from_image(Image(image.uuid, image.unsigned_blocks()))  # the Security TEDS is judged already
+    # without the Security TEDS, which was checked already
+    described = Sheet.from_image(Image(image.uuid, image.unsigned_blocks()))
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     try:
         states = OperationReply.decode(node.request(OPERATION, "to report its mode")).channels
@@ -340,13 +341,13 @@ def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) ->
         if trouble is None:
             claimed = [channel for channel in free if answers[channel.number].accepts]
             samples = tuple(_read(node, sheet, claimed))
-    except (NodeRefusedError, BadDataError) as error:  # the datasheet stands; a warning says why
+    except (NodeRefusedError, BadDataError) as error:  # the datasheet remains valid; a warning gives the reason
         trouble = error
     finally:
         if free:
             node.request(idle(0), "to let go")
     found = {number: answer.accepts for number, answer in answers.items()}
-    if trouble is not None:  # busy, a fault
+    if trouble is not None:  # busy or faulty
         return HardwareCheck(found, warnings=(_no_reading(trouble),))
     bad = [str(entry["channel"]) for entry in samples if not entry["valid"]]
     return HardwareCheck(found, samples, (invalid_readings(bad),) if bad else ())
@@ -376,7 +377,8 @@ def _bears(node: Conversation, channel: Channel, digest: bytes, *, lease: int = 
     try:
         operate(node, channel.number, digest, lease=lease, dead_man=dead_man)
     except NodeRefusedError as refusal:
-        if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor instead of an actuator
+        # BAD_FORM (4): a sensor instead of an actuator, or the reverse
+        if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):
             raise WrongBoardError(
                 f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not match this"
                 " datasheet: its hardware is of a different kind, or delivers values in a different format.",
@@ -384,10 +386,10 @@ def _bears(node: Conversation, channel: Channel, digest: bytes, *, lease: int = 
             ) from refusal
         if refusal.reason == Reason.OUT_OF_RANGE and not lease:
             return _Answer(True)
-        if refusal.reason in (Reason.BUSY, Reason.FAULT) and lease:  # these are checked last
+        if refusal.reason in (Reason.BUSY, Reason.FAULT) and lease:  # these are checked last, so the datasheet matches
             return _Answer(True, refusal)
         return _Answer(None)
-    return _Answer(True if lease else None)  # it claimed something for no time: no firmware of this profile
+    return _Answer(True if lease else None)  # a lease of 0 was accepted: the firmware does not follow the profile
 
 
 def _read(node: Conversation, sheet: Sheet, sensors: list[Channel]) -> Iterator[dict[str, Any]]:

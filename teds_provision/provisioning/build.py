@@ -63,7 +63,7 @@ from teds_provision.teds.profile.load import (
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet, described
 
-# -- the order: profile, calibration, name; read, fitted and guarded before any node is waited for ---------------------
+# -- the order: profile, calibration, name; read, fitted and guarded before waiting for a node -------------------------
 
 _UUID, _COUNT = "{uuid}", "{n}"
 _MOST_PEM: Final = 1 << 20
@@ -85,8 +85,8 @@ class BuildOrder:
     name: str | None = None
     drop_calibration: bool = False
     accept_calibration: str | None = None
-    retype: bool = False  # the board may become one of another type than it claims
-    adopt: bool = False  # whether the datasheet that the board brought is signed, by a person's yes
+    retype: bool = False  # the board may become another type than it reports
+    adopt: bool = False  # sign the factory datasheet, confirmed by the operator
     channel: int | None = None
     item: str | None = None
     trusted: tuple[Path, ...] = ()
@@ -258,7 +258,7 @@ def compose(
     warnings: tuple[str, ...] = ()
     if calibrations is None:
         calibrations, warnings = _kept_calibrations(order, has, profile)
-    elif order.channel is not None:  # it names one channel; the other ones keep theirs
+    elif order.channel is not None:  # only this channel changes; the others keep their calibration
         others, warnings = _kept_calibrations(order, has, profile, but=order.channel)
         calibrations = dict(sorted({**others, **calibrations}.items()))
     record = station.nodes.get(uuid)
@@ -275,7 +275,7 @@ def compose(
 def digest_of(profile: Profile) -> str:
     """Return the SHA-256 (hex) of a profile with all that it extends: the TEDS that it gives, and its demands."""
     place = ("digest",)
-    if place not in profile.composed:  # for the first node of this type
+    if place not in profile.composed:  # computed for the first node of this type
         profile.composed[place] = _digest(profile)
     return profile.composed[place].hex()
 
@@ -292,7 +292,7 @@ def profile_files_digest(station: Station, record: NodeRecord | None) -> str | N
         path = find_profile(record.profile, folders)
         digest = files_digest(path, folders)
         return digest if _content_of(digest, path, station.home) == record.profile_digest else None
-    except TedsProvisionError:  # a file that was moved or is being edited is no failure of the node's
+    except TedsProvisionError:  # a file that was moved or is being edited is not an error of the node
         return None
 
 
@@ -520,7 +520,8 @@ def build(
     if not keep_draft:
         return built
     with station.durable("build"):
-        if has is None or not has.unsigned_blocks():  # of a node with a datasheet the store keeps what is on it
+        # if the node has a datasheet, the store keeps the facts of that one
+        if has is None or not has.unsigned_blocks():
             facts = {"profile": plan.wanted, "profile_digest": plan.digest, "name": plan.name}
             station.nodes.remember(uuid, **{fact: value for fact, value in facts.items() if value is not None})
         station.datasheets.keep_draft(Draft(uuid, image, "built", plan.wanted))
@@ -586,12 +587,12 @@ def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) 
     """Return the wanted content, by what the node has now and what was ordered; not guarded yet."""
     order = prepared.order
     intact = _intact(station, present)
-    # only what the board brought, and keeps: it never had a datasheet
+    # The board has only fixed TEDS from its factory and never had a datasheet.
     if not intact and (order.adopt or order.profile is None) and present.is_fixed:
         return _composed(station, prepared, present, named=True)
     if order.adopt and order.name is None:
         return _as_it_is(station, present)
-    if order.adopt:  # what it has, under another name, whatever its type
+    if order.adopt:  # its factory datasheet under another name, whatever its type
         brought = read_factory_datasheet(station, present.image, name=order.name)
         return Proposal(brought.image, (), True, name=brought.name or None)
     if not intact:
@@ -680,9 +681,9 @@ def _only_what_is_named(station: Station, prepared: PreparedOrder, present: Node
             blocks.pop(block, None)
         else:
             blocks[block] = wanted
-    if prepared.order.name is not None:  # also if the profile is unchanged and the node is not
+    if prepared.order.name is not None:  # write the name even if the profile gives the same name as before
         blocks[0, AccessCode.NAME] = asked.blocks[0, AccessCode.NAME]
-    # What else the profile says now stays unwritten, so what is remembered of it is what it said then.
+    # Other changes of the profile remain unwritten, so its digest is not updated (no profile_digest here).
     return Proposal(Image(uuid, blocks), (), True, asked.warnings, asked.wanted, asked.name, asked.calibrations)
 
 

@@ -111,7 +111,7 @@ def is_busy(error: TedsProvisionError) -> bool:
     return isinstance(error, NodeRefusedError) and error.reason == Reason.BUSY
 
 
-# What a node says to an Open of which an octet was changed on the way; said twice it is what the node means.
+# Refusals of an Open that was disturbed on the bus; if the node repeats one, it counts.
 _DISTURBED = (Reason.UNKNOWN_KEY, Reason.BAD_FORM, Reason.BAD_POINT)
 
 
@@ -130,7 +130,7 @@ def came_under_key(error: BaseException) -> bool:
     each of them, a second board at the same address among others.
     """
     if isinstance(error, (LinkError, SessionLostError)) or isinstance(error.__context__, SessionLostError):
-        return False  # the context: the session was lost, and could not be opened again
+        return False  # with this context: the session was lost and could not be opened again
     return not isinstance(error, NodeRefusedError) or error.sealed
 
 
@@ -217,7 +217,7 @@ class Conversation:
         """
         self._statics = statics or self._statics
         session, reply = self._open(key)
-        # another station's Open was faster, its counter is used up; or, on a bus, a frame was disturbed
+        # The counter was used up by another station's Open, or a frame was disturbed on the bus: try once more.
         if reply.reason == Reason.BAD_TAG or (self._is_noisy and reply.reason in _DISTURBED):
             session, reply = self._open(key)
         if not reply.ok:
@@ -365,7 +365,7 @@ class Conversation:
             raw = _carry(self.contact.link, frame, within)
             _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
             reply = decode_reply(raw)
-            if inside is None or not reply.ok:  # what is sealed is told when it is opened
+            if inside is None or not reply.ok:  # sealed replies are recorded after they are opened
                 self.contact.note("in", raw, partial(describe_answer, command, reply))
             if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
                 return reply

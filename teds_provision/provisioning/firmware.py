@@ -35,7 +35,7 @@ def read_firmware(node: Conversation, *, once: bool = False) -> FirmwareReading 
     if node.reported_firmware is not None and node.reported_firmware[0] == session:
         return FirmwareReading(node.reported_firmware[1], session is not None)
     if session is None and not node.wired and node.identity.state != NodeState.FACTORY:
-        return None  # it would answer 3
+        return None  # the node would refuse with 3
     try:
         payload = (node.request if once else node.request_idempotent)(ABOUT, "to report its firmware")
     except NodeRefusedError as refusal:
@@ -120,5 +120,6 @@ def keep_firmware(station: Station, uuid: bytes, reading: FirmwareReading | None
         if stated == plant_event(before):
             if not station.plant.reports_other_firmware(uuid, stated.runs, after.at):
                 return
-            after = station.firmware_reports.renew(after)  # the same again, and other firmware in between
+            # other firmware was reported in between, so this is news again
+            after = station.firmware_reports.renew(after)
         station.plant.record_event("firmware", uuid, at=after.at, runs=stated.members)

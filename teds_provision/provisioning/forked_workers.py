@@ -50,7 +50,7 @@ def map_ranges(work: Callable[[range], Result], ranges: Sequence[range], workers
         _fork_workers(forked, workers, work)
         if forked:
             yield from _collect(forked, ranges)
-        else:  # the system has no process to spare
+        else:  # the system could not start a process
             yield from map(work, ranges)
     finally:
         _end(forked)
@@ -80,7 +80,7 @@ def _fork_workers(forked: list[_Worker], count: int, work: Callable[[range], obj
     """Fork processes into ``forked``; fewer if the system gives no more."""
     for _ in range(count):
         here, there = socket.socketpair()
-        # A signal that came between fork and the child's own settings would run the program's handler in the child.
+        # Block signals until the child has set its own handlers, or it would run those of the program.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
         try:
             pid = os.fork()
@@ -98,18 +98,19 @@ def _fork_workers(forked: list[_Worker], count: int, work: Callable[[range], obj
 def _serve(line: socket.socket, of_the_parent: Sequence[socket.socket], work: Callable[[range], object]) -> NoReturn:
     """Work on range after range in the forked process, until the parent closes the socket."""
     try:
-        for end in of_the_parent:  # held open here, it would keep its worker waiting after the parent's death
+        # if the child kept them open, other workers would go on waiting after the parent's death
+        for end in of_the_parent:
             end.close()
         for number in _ENDING:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
-        gc.freeze()  # the whole program is there before the first file: not looked through again for each few of them
+        gc.freeze()  # the objects of the program are not collected again and again
         gc.set_threshold(_RARELY)
         while len(asked := line.recv(_ASKED.size, socket.MSG_WAITALL)) == _ASKED.size:
             good, octets = _answer(work, range(*_ASKED.unpack(asked)))
             line.sendall(_ANSWERED.pack(good, len(octets)) + octets)
     finally:
-        os._exit(0)  # neither what the parent has in its buffers nor its clean-up is this process's
+        os._exit(0)  # skips the parent's buffers and exit handlers
 
 
 def _answer(work: Callable[[range], object], places: range) -> tuple[bool, bytes]:
@@ -146,7 +147,7 @@ def _collect(forked: Sequence[_Worker], ranges: Sequence[range]) -> Iterator[Any
 
 def _hand(worker: _Worker, place: int, places: range) -> None:
     worker.places.append(place)
-    with suppress(ConnectionError):  # it is gone, which reading from it reports
+    with suppress(ConnectionError):  # a read reports that the worker is gone
         worker.line.sendall(_ASKED.pack(places.start, places.stop))
 
 
@@ -167,7 +168,7 @@ def _gone(worker: _Worker) -> BaseException:
     """Return the error for a worker that ended before its work was done."""
     status = _wait(worker)
     if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGINT:
-        return KeyboardInterrupt()  # Ctrl-C goes to both, and was sooner there
+        return KeyboardInterrupt()  # Ctrl-C goes to both processes, and reached this one first
     how = f"was ended by signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else "ended"
     return TedsProvisionError(
         f"A process that judged a part of the files {how}; the files without a line were not judged.",

@@ -121,7 +121,7 @@ def _facts(station: Station, who: IdentifiedNode, *, counts: bool) -> dict[str, 
     facts: dict[str, object] = {"point": who.point} if counts else {}
     known = station.nodes.get(who.uuid)
     if counts or (known is not None and known.point == who.point):
-        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be a stranger's
+        facts["last_seen"] = utc_now()  # only under the pinned key; with another key it may be another board
     return facts
 
 
@@ -291,7 +291,7 @@ def identify_at(
     as a notice; else the first error is raised.
     """
     if add:
-        station.unlock()  # before a node is there: the vault makes a pin's MAC
+        station.unlock()  # before the wait for a node: the MAC of a pin needs the vault
     if watch:
         yield from watch_nodes(links, lambda node: _identified(station, node, add), reporter, stop or threading.Event())
         return
@@ -306,7 +306,7 @@ def identify_at(
             if len(nodes) > 1:
                 text = f"Node {node.uuid.hex()} was not identified: {found.message}"
                 reporter.notice(Notice("unfinished", text, uuid=node.uuid))
-        # a button counts until the last node was identified, and another one pressed with it takes its mark away
+        # Read the buttons last: a second pressed node makes the mark ambiguous, and then no node has it.
         marked = [replace(found, pressed=node.contact.pressed()) for node, found in proven]
     yield from (Arrival(found.who.uuid, links.places[0], 0.0, found) for found in marked)
     if first is not None and not marked:
@@ -336,7 +336,7 @@ def _side_by_side(
             while nodes and id(nodes[0]) in ended:
                 node, nodes = nodes[0], nodes[1:]
                 yield node, ended[id(node)]
-    finally:  # after a Ctrl-C there is no wait: the bus is closed next
+    finally:  # after Ctrl-C do not wait: the bus is closed next
         team.drop_waiting()
 
 
@@ -350,7 +350,7 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
     name = (known.name if known else None) or described.name
     facts: dict[str, object] = {}
     read = station.datasheets.reading(who.uuid)
-    if read is None or not read.is_datasheet:  # nothing is verified here: it fills in what is not known better
+    if read is None or not read.is_datasheet:  # unverified, so only used if nothing better is known
         facts["channels"] = described.channels
         if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
             facts["name"] = name

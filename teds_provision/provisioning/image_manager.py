@@ -165,7 +165,7 @@ class ImageManager:
         if isinstance(link, TransferLink) and link.wait_for_air():
             largest = min(largest, _SHORT_PACKET)
         empty = self._image.ImageUploadWriteRequest(off=offset, data=b"", **more)
-        return max(1, largest - len(empty.BYTES) - 2)  # the length of the data takes up to 2 octets more
+        return max(1, largest - len(empty.BYTES) - 2)  # the length of the data takes up to 2 more octets
 
     def _fit_buffer(self) -> None:
         """Ask once how long a packet may be."""
@@ -180,7 +180,7 @@ class ImageManager:
         self._largest = min(self._largest, found.buf_size)
         self._asked_size = True
 
-    # -- one exchange ----------------------------------------------------------------------------------------------
+    # -- requests and replies --------------------------------------------------------------------------------------
 
     def _ask(self, request: Request, kind: type[Reply], doing: str) -> Reply:
         asked = decode_packet(request.BYTES)

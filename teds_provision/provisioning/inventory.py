@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from teds_provision.station import firmware
     from teds_provision.station.firmware import KnownFirmware
     from teds_provision.teds.fits import Fit, Requirement
-else:  # cryptography: a list of unverified nodes needs none
+else:  # imports cryptography, which a list of unverified nodes does not need
     readings, firmware = late("teds_provision.provisioning.readings"), late("teds_provision.station.firmware")
 
 CHUNK = 256

@@ -126,7 +126,7 @@ def _met_somewhere(
         except (
             NoNodeError,
             NoReaderError,
-        ) as error:  # off, elsewhere, or an adapter that is not plugged in: a tap may come
+        ) as error:  # the node is off or elsewhere, or the adapter is not plugged in: go on, a tap may come
             _log.debug("%s is not at %s: %s", uuid.hex(), place, error.message)
     left = replace(links, timeout=max(0.1, links.timeout - (time.monotonic() - began)))
     try:
@@ -259,7 +259,6 @@ def _finished(station: Station, identity: Identity) -> bool:
 
 
 # -- tap first, then over BLE (profile.md, "BLE") ------------------------------------------------------------------
-# The node may stay on the reader or be carried away meanwhile: the tap gave its BLE address, its key proves who it is.
 
 
 def continue_over_ble(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
@@ -290,7 +289,7 @@ def continue_over_ble(links: LinkSettings, notice: NoticeSink) -> Callable[[Conv
     return go_on
 
 
-# -- node after node: the same work for each until told to stop; one that fails does not end it -------------------
+# -- node after node: the same work for each until stopped; an error ends only one node ---------------------------
 
 Result = TypeVar("Result")
 _LOOK_SECONDS = 0.2
@@ -337,7 +336,7 @@ class IdleStop(threading.Event):
         try:
             yield
         finally:
-            self.renew()  # before the count goes down: no instant at which the old time is over
+            self.renew()  # renewed before the count drops, so that the old deadline never applies
             with self._counting:
                 self._busy -= 1
 
@@ -398,7 +397,7 @@ def _watch(
         try:
             with Conversation(contact, notice=reporter.notice) as node:
                 result = work(node)
-        except VaultLockedError:  # of the whole command, and of no node
+        except VaultLockedError:  # concerns the whole command, not one node
             raise
         except TedsProvisionError as failure:
             error = failure

@@ -126,7 +126,7 @@ def verify_only(station: Station, node: Conversation, line: ProductionLine, repo
         raise
 
 
-# -- what a line asks of a run (plant/line.py): an order, a unit before a key is agreed on, proof at the end -----------
+# -- the interface of a line (plant/line.py): an order, a unit before the key agreement, proof at the end --------------
 
 
 class Unit(Protocol):
@@ -250,7 +250,7 @@ class _Run:
         self.line = line
         self.unit: Unit | None = None
         self._enlisting: StepResult | None = None
-        self.released = False  # the running `ncap` measured the node and let it go
+        self.released = False  # True if the running `ncap` measured the node and released it
 
     def proven(self) -> ProvisionResult:
         """Return the run.
@@ -267,7 +267,7 @@ class _Run:
                 cause = error.cause if isinstance(error, SessionLostError) else error
                 self.unit.failed(self.node, who, self.steps.done, self.steps.current, cause)
             raise
-        self.node.leave()  # while the last record goes to the disk, for which the result waits
+        self.node.leave()  # meanwhile the last record is written to disk
         return done
 
     def keyed(self) -> IdentifiedNode:
@@ -278,13 +278,13 @@ class _Run:
 
     def run(self, who: IdentifiedNode) -> ProvisionResult:
         prepared = self._prepared(who)
-        # before it becomes ours, or costs a unit
+        # Before the board is keyed, or uses up a unit.
         if prepared.profile is not None and (who.state == NodeState.FACTORY or self.line is not None):
             shown = shown_by(self.node, {channel.number for channel in prepared.profile.channels})
             changes = differences(shown, prepared.profile, prepared.calibrations or ())
             self._require_its_board(who, prepared, changes)
         demand = self._firmware_demand(who, prepared)
-        if demand is not None:  # a hint outside a session: it may refuse, never permit
+        if demand is not None:  # unauthenticated, so it can cause a refusal but not an acceptance
             require_firmware(who.uuid, demand, read_firmware(self.node))
         entry = self._whitelist(who)
         if self.line is not None:
@@ -327,7 +327,7 @@ class _Run:
 
     def _identify(self) -> IdentifiedNode:
         with self.steps.step("identify") as step:
-            # evidence names what the board showed
+            # A line's evidence states what the board sent, so nothing is recalled from the store.
             who = identify(self.station, self.node, expect=self._choose, recall=self.line is None)
             step.detail = f"{who.uuid.hex()}, key {who.fingerprint[:16]}"
         return who
@@ -341,7 +341,8 @@ class _Run:
         order = self.order
         prepared = prepare(self.station, order, who.uuid) if isinstance(order, BuildOrder) else order
         assert isinstance(prepared, PreparedOrder), "_choose() has asked"
-        if prepared.profile is None and prepared.order.calibration is not None:  # of the type that this node has
+        # the calibration is for the type that this node has
+        if prepared.profile is None and prepared.order.calibration is not None:
             prepared = prepare(self.station, prepared.order, who.uuid)
         if prepared.profile is None and who.state != NodeState.PROVISIONED and not prepared.order.adopt:
             known = self.station.nodes.get(who.uuid)
@@ -367,7 +368,7 @@ class _Run:
         return entry
 
     def _agree(self, who: IdentifiedNode, entry: WhitelistEntry | None) -> AgreeResult:
-        listed = False  # a key that was agreed on came with it: no need to wait for the record that is on its way
+        listed = False  # listed with a new key: do not wait for the record that is being written
         try:
             with self.steps.deferred("agree") as step:
                 agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.operator.take_over)
@@ -382,7 +383,8 @@ class _Run:
 
     def _build(self, who: IdentifiedNode, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
         with self.steps.step("build") as step:
-            if prepared.profile is not None:  # before a calibration is held against a channel that it is not of
+            # check the type first, so that a calibration is compared with the right channel
+            if prepared.profile is not None:
                 changes = differences(present.image.blocks, prepared.profile, prepared.calibrations or ())
                 self._require_its_board(who, prepared, changes)
             brings = prepared.order.adopt and present.identity.state != NodeState.PROVISIONED
@@ -417,7 +419,7 @@ class _Run:
                 return elsewhere
             draft = self.station.datasheets.draft(who.uuid)
             earlier = draft.image.blocks.get(SECURITY) if draft is not None and draft.stage == "signed" else None
-            # a node whose TEDS are not what it was signed for takes them only under a newer sequence
+            # If the node's TEDS differ from the signed ones, it accepts them only with a newer sequence.
             intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
             signed = sign(
                 self.station,
@@ -470,7 +472,7 @@ class _Run:
 
     def _verify(self, who: IdentifiedNode, written: WriteResult) -> Verification:
         with self.steps.step("verify") as step:
-            # of a line the evidence follows, which nothing but its own challenge to the board precedes
+            # For a line, evidence follows, and only its challenge to the board comes before it.
             verified = judge_and_keep(
                 self.station,
                 self.node,

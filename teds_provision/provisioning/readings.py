@@ -90,7 +90,8 @@ def keep_judged(
     station: Station, row: NodeReading, judged: NodeVerdict, image: Image, profile: str | None = None
 ) -> None:
     """Keep what :func:`judge_reading` gave of ``image``."""
-    worth = row.in_session and judged.verified.verdict != "not authentic"  # else what it had stays known
+    # otherwise the datasheet known so far is kept
+    worth = row.in_session and judged.verified.verdict != "not authentic"
     station.datasheets.keep_reading(row, image if worth else None, profile)
 
 
@@ -155,9 +156,7 @@ def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]
     held = set(keyed)
     try:
         judging = snapshot_trust_of(station, [row.uuid for row in rows])
-    except (
-        StoreChangedError
-    ):  # of one node another program wrote the pin: it costs that one its verdict, not the others
+    except StoreChangedError:  # another program changed a pin: only that node loses its verdict
         found = {row.uuid: _judged_or_not(station, row, keyed=row.uuid in held) for row in rows}
     else:
         found = {row.uuid: _judged(judging, row, keyed=row.uuid in held) for row in rows}
@@ -176,7 +175,8 @@ def _judged_or_not(station: Station, row: NodeReading, *, keyed: bool) -> NodeVe
 def _judged(station: TrustSource, row: NodeReading, *, keyed: bool) -> NodeVerdict:
     signers = Signers(row.node_key, row.node_key_signature, row.station_key, row.station_key_signature)
     checks = judge(station, row.uuid, _read(row.checks), signers, digests_of(row).get(SECURITY))
-    if row.station_key is None and all(check.result != "failed" for check in checks):  # a row of no reading of ours
+    # a row that this program did not write
+    if row.station_key is None and all(check.result != "failed" for check in checks):
         checks.append(Check("signed", "failed", "it does not say who signed it"))
     if not any(check.name == "session" for check in checks):
         why = "its datasheet was last read outside a session" if keyed else ""

@@ -126,8 +126,8 @@ def sign(
         if not can_be_stored(block) or not passes_own_check(block, teds):
             raise BadDataError(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
     if sequence is None:
-        # What says the same is not signed anew, so a run that is repeated leaves the node as it is. A signature that
-        # never arrived is good while its sequence is above the node's: the node takes no other.
+        # An equal datasheet is not signed again, so that a repeated run does not change the node. A signature that
+        # never reached the node can be used if its sequence is above the node's; the node refuses others.
         for octets in filter(None, (on_node, *earlier)):
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
@@ -136,10 +136,10 @@ def sign(
     station.plant.require_role(
         "sign", "cannot sign datasheets", "Have a station sign it that has this role: sign --by OFFICE"
     )
-    credentials = station.credentials(keys.uuid)  # may ask for the passphrase: not while the store is held
+    credentials = station.credentials(keys.uuid)  # may ask for the passphrase, so not within the transaction
     with station.durable("sign", more_follows=write_follows):
         known = station.nodes.get(keys.uuid)
-        # The store knows of signatures that never reached the node, the node of those by other stations.
+        # The store has signatures that never reached the node, and the node may have some by other stations.
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
         if number > LAST_SEQUENCE:
             raise PolicyError("This node has no sequence numbers left.")
@@ -335,7 +335,7 @@ def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image 
     brought = security.decode(file.blocks[SECURITY])
     epoch = max(epoch, brought.key_epoch)
     if brought.signed and brought.station_key == station.point:
-        return _PresentTeds(known, epoch, sequence)  # this very sequence was given here: the signature may still hold
+        return _PresentTeds(known, epoch, sequence)  # the sequence was given here, so the signature may still be used
     highest = max(sequence, record.sequence if record else 0)
     if highest and brought.sequence > highest + SEQUENCE_WINDOW:
         raise PolicyError(

@@ -131,7 +131,7 @@ def plan_or_refusal(
             avoid_measuring_source(station, port, uuid)
             looked = _Update(station, port, links.timeout, uuid, order, reporter)
             plan = looked.plan()
-            if plan.interrupts and not station.service_runs():  # a command releases nothing
+            if plan.interrupts and not station.service_runs():  # a command cannot release nodes of another process
                 raise FrozenError(
                     f"Node {uuid.hex()} is being measured by {plan.interrupts[0]}.", hint="End that measurement first."
                 )
@@ -222,13 +222,13 @@ def _at_port(
     try:
         for done in work.results():
             yield done.result()
-    finally:  # after a Ctrl-C there is no wait: the bus is closed next
+    finally:  # after Ctrl-C do not wait: the bus is closed next
         work.drop_waiting()
 
 
 def read_about(node: Conversation) -> FirmwareReport | None:
     """Read About in the open session; None for a node that does not report its firmware."""
-    node.reported_firmware = None  # it changes within the session
+    node.reported_firmware = None  # the report changes within the session
     reading = read_firmware(node)
     return None if reading is None else reading.report
 
@@ -243,7 +243,7 @@ def require_free_actuators(node: Conversation) -> None:
     try:
         channels = OperationReply.decode(node.request_idempotent(OPERATION, "to report its mode")).channels
     except NodeRefusedError:
-        return  # it does not measure
+        return  # the node does not measure
     claims = ChannelState.CLAIMED_HERE | ChannelState.CLAIMED_BY_OTHER
     claimed = [number for number, (state, _) in channels.items() if state & ChannelState.ACTUATOR and state & claims]
     if claimed:
@@ -361,7 +361,7 @@ class _Update(_Look):
         self._octets = 0
         self._point = b""
 
-    # -- what others call ------------------------------------------------------------------------------------------
+    # -- public ----------------------------------------------------------------------------------------------------
 
     def plan(self) -> UpdatePlan:
         """Return what :meth:`run` would do."""
@@ -382,7 +382,7 @@ class _Update(_Look):
             result = "reverted" if isinstance(error, RevertedError) else result_of(error)
         done = BoardUpdate(self._uuid, result, self._before, self._octets, time.monotonic() - began, error)
         cut = isinstance(error, LinkClosedError) or (error is not None and self._is_ending())
-        if result != "already" and not cut:  # what was cut goes on later
+        if result != "already" and not cut:  # an interrupted update continues later
             facts = {"from": self._before, "to": self._order.image.version_text, "image": self._digest.hex()}
             with suppress(TedsProvisionError):  # a full disk must not hide what happened
                 self._station.audit(
@@ -500,7 +500,7 @@ class _Update(_Look):
             with self._station.durable("update"):
                 keep_firmware(self._station, self._uuid, FirmwareReading(report, sealed=True), signed=True)
 
-    # -- there and back --------------------------------------------------------------------------------------------
+    # -- revert and retry ------------------------------------------------------------------------------------------
 
     def _revert(self, node: Conversation, cause: TedsProvisionError) -> None:
         """Restart a board whose new image did not prove itself, and raise how that ended."""

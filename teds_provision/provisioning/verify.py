@@ -24,7 +24,7 @@ from teds_provision.teds.image import SECURITY, BlockId, Image
 if TYPE_CHECKING:
     from teds_provision.protocol.plant.signer import SignerVerdict
 
-# -- what it is judged by: a station's keys, pins and deny list, asked one by one or remembered for many ---------------
+# -- the grounds of a verdict: a station's keys, pins and deny list, looked up singly or as a snapshot for many --------
 
 
 class PinLookup(Protocol):
@@ -222,7 +222,8 @@ def _all_proofs(images: Sequence[Image]) -> list[_SecurityFields]:
         security.tbs(image.uuid, image.blocks[SECURITY]) if isinstance(shown, SecurityTeds) and shown.signed else None
         for image, shown in zip(images, read, strict=True)
     ]
-    alone = len(images) == 1  # each step of a provisioning asks again; of many files none is asked for twice
+    # a provisioning checks one image several times, so use the caches; many files are checked once each
+    alone = len(images) == 1
     node_good = node_key_good if alone else node_key_good_once
     datasheet_good = datasheet.message_signature_good if alone else datasheet.message_signature_good_once
     node_keys = [

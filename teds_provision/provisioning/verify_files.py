@@ -89,7 +89,7 @@ class VerdictTotals:
 RowFormatter = Callable[[FileVerdict], str]
 """The line of one file, as it is shown; called in whichever process judged it."""
 
-# From good to bad: a harmful calibration, a file that is not there or holds no image, one that is not authentic.
+# From good to bad: a harmful calibration, a file that is missing or is not an image, one that is not authentic.
 _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
 
 
@@ -106,7 +106,7 @@ def verify_files(
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, at + 1)) for at in range(len(files)))
         return
-    yield work.judge(range(1))  # what is loaded late is there before there are more processes
+    yield work.judge(range(1))  # loads the late modules before the fork
     size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
     yield from map_ranges(
         work.judge, [range(at, min(at + size, len(files))) for at in range(1, len(files), size)], workers
@@ -176,7 +176,7 @@ def _verdict(file: str, image: Image, checks: Sequence[Check]) -> FileVerdict:
 def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
     """Look at the calibrations, as every command does before it trusts a datasheet."""
     if not any(code == AccessCode.CALIBRATION for _, code in image.blocks):
-        return result  # and the guard is not loaded
+        return result  # saves loading the guard
     findings = teds.guard.check_calibration(image.unsigned_blocks())
     texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
     harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]

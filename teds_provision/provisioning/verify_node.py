@@ -148,7 +148,7 @@ def judge_and_keep(
 
     if more_follows:
         station.join_next_step(record)
-    else:  # a run prints its result when it is on the disk, and asks the hardware meanwhile
+    else:  # in a run, the result waits for the disk; the hardware check goes on meanwhile
         station.run_in_background(record_durably)
     return judged
 
@@ -217,7 +217,7 @@ def verify_at(
             finally:
                 in_session = visit.node.sealed
         image, verified = looked.image, looked.verified
-    except NodeRefusedError as refusal:  # outside a session anyone may have sent it: it decides nothing
+    except NodeRefusedError as refusal:  # outside a session, any device may have sent it, so it decides nothing
         if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
             raise
         station.audit("verify", found, "unproven", why=refusal.message)

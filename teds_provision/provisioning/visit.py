@@ -24,7 +24,7 @@ class NodeVisit:
     station: Station
     node: Conversation
     who: IdentifiedNode
-    released: bool = False  # the running `ncap` measured the node and let it go
+    released: bool = False  # True if the running `ncap` measured the node and released it
 
 
 @contextmanager

@@ -37,7 +37,7 @@ _SHOWN_MISTAKES = 10
 _MAX_NAME = 200
 _MAX_DEPTH = 16
 _MAX_TAG = 65_536
-_MOST_TAGS = 12 * MAX_ENTRIES  # an entry of five elements with their ends, and what stands around it
+_MOST_TAGS = 12 * MAX_ENTRIES  # start and end tags of an entry with five elements
 _MOST_LINES = 4 * MAX_ENTRIES
 _UUID_DIGITS = 2 * UUID_OCTETS
 _NAME_RULE = f"a name is printable and has at most {_MAX_NAME} characters"
@@ -215,7 +215,7 @@ def _read_xml(text: str, reading: _WhitelistReader) -> None:
             _close_element(element, self.open[-1] if self.open else None, reading)
 
     check_count(text.count("<"), _MOST_TAGS, f"tags in {reading.file}")
-    _refuse_long(text, "<", reading.file, "a tag or text")  # a million attributes would all be held in memory at once
+    _refuse_long(text, "<", reading.file, "a tag or text")  # a million attributes would all be in memory at once
     parser = DefusedExpatParser(forbid_dtd=True)
     handler = Handler()
     parser.setContentHandler(handler)
@@ -251,7 +251,7 @@ def _close_element(element: _Element, parent: _Element | None, reading: _Whiteli
     text = "".join(element.text).strip()
     leaf = not element.uuids and not element.entries
     if parent is not None and leaf and text and not element.fields and element.tag in FIELDS:
-        # <fingerprint>…</fingerprint>: a text under a field's name belongs to the element around it
+        # <fingerprint>…</fingerprint>: the text of an element with a field's name is a field of the element around it.
         parent.take_field(element.line, element.tag, text)
         return
     entries = element.entries + _entry_of(element, text, leaf, parent is None, reading)
@@ -372,7 +372,7 @@ def _with_lines(text: str, *, inside: bool) -> Iterator[tuple[int, Any]]:
         while text[at] != "}":
             key, at = decoder.raw_decode(text, at)
             at = skip(at)
-            start = at if key == "whitelist" else start  # of two, json takes the last
+            start = at if key == "whitelist" else start  # of two equal names, json uses the last
             _, at = decoder.raw_decode(text, at)
             at = skip(at)
         assert start is not None

@@ -135,7 +135,7 @@ def _report_written(station: Station, image: Image, known: NodeRecord, sequence:
             epoch=security.decode(octets).key_epoch,
             sequence=sequence,
             teds_sha256=hashlib.sha256(octets).hexdigest(),
-            profile=PurePath(known.profile).name if known.profile else None,  # of a file its name, not its path
+            profile=PurePath(known.profile).name if known.profile else None,  # the name of a file, without its path
             profile_sha256=profile_files_digest(station, known),
             due=known.due,
         )
@@ -160,7 +160,7 @@ def _conclude(
     named = profile if isinstance(profile, str) else None
     c = (c or node.open_counter) if node.sealed else None
 
-    def record() -> None:  # asks the node nothing: the next message may be on its way
+    def record() -> None:  # does not use the node, so the next message may already be on its way
         with station.durable("write", more_follows=True):
             keep_read(
                 station, back, c, by="write", floor=freshness_floor_of(station, image.uuid, identity), profile=named
@@ -171,13 +171,13 @@ def _conclude(
                 known = station.nodes.remember(image.uuid, **facts)
                 keep_firmware(station, image.uuid, firmware, signed=True)
                 _report_written(station, image, known, sequence)
-                # A draft that is on the node now is none any more; a newer trial stays
+                # The draft is on the node now, so drop it; a newer draft remains.
                 draft = station.datasheets.draft(image.uuid)
                 if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
                     station.datasheets.drop_draft(image.uuid)
                 station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
 
-    station.run_in_background(record)  # the next verification has the node prove its key meanwhile
+    station.run_in_background(record)  # meanwhile, the next verification asks the node to prove its key
     if differing:
         channel, access_code = differing[0]
         raise NotAuthenticError(
@@ -222,7 +222,7 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
         except NodeRefusedError as refusal:
             if refusal.reason != Reason.DIGEST_MISMATCH or not skip:
                 raise
-            skip = set()  # the node does not hold what it was last read to hold: send everything
+            skip = set()  # the stored image of the node is out of date: send all blocks
             continue
         except (NodeSilentError, GarbledError):
             if not node.is_alive():

@@ -15,7 +15,7 @@ from teds_provision.shapes.metadata import Meta
 from teds_provision.shapes.verdict import VerdictWord
 
 
-class KnownNode(NamedTuple):  # a tuple: there are a hundred thousand of them in a list, and a dataclass took 6 us more
+class KnownNode(NamedTuple):  # a tuple: lists hold a hundred thousand of them, and a dataclass took 6 us more to make
     """One node, each member as JSON has it; None and empty for what is not known.
 
     ``verdict`` is judged by today's trust from the row that ``reading`` is about. ``channels`` counts them; ``due`` is

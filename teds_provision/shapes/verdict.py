@@ -25,7 +25,7 @@ MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
 """Checks that fail if the only fault is a missing signature."""
 
 
-class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
+class Check(NamedTuple):  # a tuple, to save time: ten thousand files have thirteen checks each
     """One check of the datasheet; ``why`` is the finding.
 
     ``kept``: the TEDS concerned were not read again since the node last started; those of the last reading are judged
@@ -57,13 +57,13 @@ class Verification:
     checks: tuple[Check, ...]
     scope: Scope = "node"
 
-    @cached_property  # asked for several times of each of ten thousand files
+    @cached_property  # read several times for each of ten thousand files
     def verdict(self) -> VerdictWord:
         """One word for all checks."""
         failed = {check.name for check in self.checks if check.result == "failed"}
         if PAGES in failed and failed <= {PAGES, SESSION}:
             return "unproven"
-        if SESSION in failed:  # what came without a session proves nothing, except that it is too old
+        if SESSION in failed:  # without a session, only the checks of freshness count
             return "not authentic" if failed & FRESHNESS else "unproven"
         if failed - MERELY_UNSIGNED:
             return "not authentic"
@@ -99,7 +99,7 @@ class NodeVerdict:
         return {"from": self.origin, "at": self.at, "by": self.by}
 
 
-KeptMember = TypedDict("KeptMember", {"from": NotRequired[Literal["kept"]]})  # a keyword of Python
+KeptMember = TypedDict("KeptMember", {"from": NotRequired[Literal["kept"]]})  # "from" is a keyword of Python
 
 
 class CheckMembers(KeptMember):

@@ -243,7 +243,7 @@ def is_whole(image: Image) -> bool:
     try:
         return security.decode(image.security).signed_blocks.keys() <= image.blocks.keys()
     except BadDataError:
-        return True  # not of this profile: it lists nothing
+        return True  # a Security TEDS of another kind, which lists no TEDS
 
 
 def _first_due(image: Image) -> str | None:

@@ -123,7 +123,7 @@ class FirmwareDemands:
         return self._read[profile]
 
 
-@lru_cache(maxsize=64)  # two hundred nodes of one type that come together are asked about one by one
+@lru_cache(maxsize=64)  # two hundred nodes of one type may start together, with one call each
 def _demand(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> FirmwareDemand | None:
     """Read what a profile demands of the firmware; again each second, as the profiles that it extends may change."""
     return teds.profile.load_profile(path, folders).firmware

@@ -171,7 +171,7 @@ class Groups:
         """Hold a group as it is; raises FrozenError if another process does."""
         digest = hashlib.sha256(
             name.encode()
-        ).hexdigest()  # 64 characters of any script are more than a file name takes
+        ).hexdigest()  # a name of 64 characters in any script can be too long for a file name
         place = self._home / f"measuring-{digest}.lock"
         descriptor = open_lock(place)
         try:

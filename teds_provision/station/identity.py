@@ -146,7 +146,7 @@ class StationIdentity:
         with self._store.transaction():
             self.put(replace(self._facts, rewrapping=None))
 
-    # -- the key of row MACs, when the vault opens -------------------------------------------------------------------
+    # -- the key of row MACs, available once the vault is open -------------------------------------------------------
 
     def unlocked(self, vault: Vault) -> None:
         """Check the station's own facts when the vault has opened; row MACs are checked from now on.
@@ -252,5 +252,5 @@ class StationIdentity:
 
 
 def _bound(record: StationRecord) -> Values:
-    # The last is the column taken_over, which is no longer written: MACs that were made over it go on holding.
+    # The last value was the column taken_over, which is no longer written; with None, older MACs still verify.
     return (record.requested, record.point, record.ca, record.signature, None)

@@ -26,7 +26,7 @@ _UUID_DIGITS, _FINGERPRINT_DIGITS = 20, 64
 _LENGTH = len(PREFIX) + 1 + _UUID_DIGITS + 1 + _FINGERPRINT_DIGITS
 _KEYS: Final = "ABCDEFTS"
 _LAYOUTS: Final = {
-    "": "ABCDEFTS",  # and German, Turkish Q, and others that have these letters where a US keyboard has them
+    "": "ABCDEFTS",  # also German, Turkish Q, and all layouts that have these letters at the same keys
     "French": "QBCDEFTS",
     "Dvorak": "AXJE>UYO",
     "Russian": "ФИСВУАЕЫ",
@@ -38,7 +38,7 @@ _LAYOUTS: Final = {
 
 Dvorak's E without Shift is a full stop; digits are the same but on a French layout, which needs Shift for them.
 """
-_LOWER: Final = str.maketrans({"İ": "i", ">": "."})  # what lower() alone would not give
+_LOWER: Final = str.maketrans({"İ": "i", ">": "."})  # exceptions to lower()
 _FRENCH_DIGITS: Final = dict(zip("à&é\"'(-è_ç", "0123456789", strict=True))
 _MODULE, _QUIET = 8, 4
 
@@ -94,7 +94,8 @@ def read_label(text: str) -> tuple[bytes, str] | None:
 def _table(layout: str, letters: str) -> dict[int, str]:
     """Return the table from what a layout types to the keys of a US keyboard, with and without Shift."""
     table = dict(zip(letters, _KEYS, strict=True))
-    small = [letter.translate(_LOWER).lower() for letter in letters]  # one by one: the last sigma of a word is another
+    # singly: at the end of a word, lower() gives another sigma
+    small = [letter.translate(_LOWER).lower() for letter in letters]
     table |= dict(zip(small, _KEYS, strict=True))
     return str.maketrans(table | (_FRENCH_DIGITS if layout == "French" else {}))
 

@@ -27,7 +27,7 @@ from teds_provision.station.store.lock import OwnerLock, UsageLock, UsageLockTak
 from teds_provision.station.store.records import COMMAND, DetectionMode, KeptMeasurement
 from teds_provision.station.store.store import Store
 
-FOLDER = "measuring"  # of the home: who measures what now
+FOLDER = "measuring"  # in the home: which process measures which node now
 
 STATION = bytes(10)
 """Key of the station in :attr:`Measurements.names`: the first part of every topic."""
@@ -62,7 +62,7 @@ class Measurements:
         """Return every one that is kept, oldest first; removes those of dead commands."""
         kept = self._rows()
         dead = {measurement.id for measurement in kept if self._is_of_dead_command(measurement)}
-        with suppress(StoreError):  # a full disk hides no list; the next reader tries again
+        with suppress(StoreError):  # with a full disk the list is still returned; the next call tries again
             for measurement_id in dead:
                 self.forget(measurement_id)
         return [measurement for measurement in kept if measurement.id not in dead]
@@ -117,8 +117,8 @@ class Measurements:
         """
         kept = [measurement.id for measurement in self.of_group(group)]
         if not kept and self._groups.find(group) is None:
-            return False, ()  # a name without a group gets no lock file
-        with self._groups.frozen(group):  # measured now: refused for that, whatever may go with it
+            return False, ()  # no lock file for a group that does not exist
+        with self._groups.frozen(group):  # refuses if the group is being measured, whatever `also` permits
             kept = [measurement.id for measurement in self.of_group(group)]
         with self._store.together():
             if set(kept) - set(also):
@@ -169,10 +169,10 @@ class Measurements:
         """
         owned = replace(measurement, id=secrets.token_hex(8), owner=COMMAND, pid=os.getpid(), started=_process_start())
         with OwnerLock(self._home, owned.id):
-            self.all()  # whatever a dead command left goes now
+            self.all()  # removes the rows of dead commands
             try:
                 yield self.keep(owned)
-            finally:  # only a process that dies leaves it to the next reader
+            finally:  # only after a crash is the row left for the next reader
                 self.forget(owned.id)
 
     def forget(self, measurement_id: str) -> bool:

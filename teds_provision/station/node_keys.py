@@ -203,14 +203,14 @@ class NodeKeys:
         """
         try:
             return self._unwrapped(record, self._vault())
-        except UnknownMasterKeyError:  # of the vault as it was a moment ago, or of a record as old as that
+        except UnknownMasterKeyError:  # the record or the vault was read before the master key changed
             vault = self._reopened()
         there = (held for held in self.keys_of(record.uuid) if held.key_id == record.key_id)
         fresh = next(there, record)
         try:
             return self._unwrapped(fresh, vault)
         except UnknownMasterKeyError:
-            if self._identity.master in vault.masters():  # lost, and not only for a read at an earlier moment
+            if self._identity.master in vault.masters():  # the key is damaged; it was not just read too early
                 raise
         raise VaultChangedError("Another command has just changed the master key.", hint="Run this again.")
 
@@ -375,7 +375,7 @@ class NodeKeys:
             values = {**change, **sealed}
             after = (
                 KeyFlags(**values) if before is _NO_FLAGS else replace(before, **values)
-            )  # replace() costs four times
+            )  # replace() takes four times as long
             if after != before:
                 wanted[uuid] = after
         if wanted:
@@ -489,7 +489,8 @@ class NodeKeys:
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Return who else holds keys: of this node, or of all."""
-        which, values = ("", ()) if uuid is None else ("WHERE uuid = ?", (uuid,))  # by the index: there may be 100,000
+        # the index is used: there may be 100,000 rows
+        which, values = ("", ()) if uuid is None else ("WHERE uuid = ?", (uuid,))
         return self._store.read(Holder, f"SELECT * FROM holders {which} ORDER BY uuid, since, fingerprint", values)
 
     def all_holders(self) -> set[str]:

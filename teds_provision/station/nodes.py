@@ -24,7 +24,7 @@ from teds_provision.station.store.store import Store
 if TYPE_CHECKING:
     import difflib
 else:
-    difflib = late("difflib")  # for a name that was mistyped
+    difflib = late("difflib")  # for suggestions if a name is mistyped
 
 _MOST_NAMES: Final = 10_000
 _LONGEST: Final = 64
@@ -99,7 +99,7 @@ class Nodes:
 
     def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
         """Bring what is known of a node up to date and return it."""
-        with self._store.together():  # no other process changes what was read before it is written
+        with self._store.together():  # so that no other process changes the row between read and write
             present = self.get(uuid)
             before = present or NodeRecord(uuid)
             mac = self._mac_of(uuid, facts.get("point", before.point), present)
@@ -261,7 +261,7 @@ def _exported(*row: Any) -> ExportedNode:
     return ExportedNode(*values)
 
 
-@lru_cache(maxsize=256)  # nodes may be 100,000, and groups are few
+@lru_cache(maxsize=256)  # there may be 100,000 nodes, but only a few groups
 def _groups(listed: str) -> tuple[str, ...]:
     return tuple(json.loads(listed))
 

@@ -18,7 +18,7 @@ from teds_provision.teds.origin import ORIGIN, Origin, origin_of
 
 _TABLES = ("nodes", "whitelist", "keys", "tombstones", "revocations")
 _KNOWN = f"({' UNION '.join(f'SELECT uuid FROM {table}' for table in _TABLES)})"
-# table by table: SQLite would put the whole of _KNOWN together before it looks for one
+# One EXISTS per table: with _KNOWN, SQLite would build the whole union before it searches.
 _IS_KNOWN = " OR ".join(f"EXISTS (SELECT 1 FROM {table} WHERE uuid = ?1)" for table in _TABLES)
 _NAME = "coalesce(n.name, w.name, '')"
 _NAMES_TWICE = "SELECT name FROM nodes WHERE name IS NOT NULL GROUP BY name HAVING count(*) > 1"
@@ -29,13 +29,14 @@ _OTHERS_NAMES = (
 _UNVERIFIED = (
     "SELECT uuid FROM keys WHERE state = 'active' EXCEPT SELECT uuid FROM readings WHERE c IS NOT NULL"
     " EXCEPT SELECT uuid FROM nodes WHERE retired IS NOT NULL EXCEPT SELECT uuid FROM tombstones"
-    " EXCEPT SELECT uuid FROM revocations ORDER BY uuid"  # tables in the order of their key: one merge
+    " EXCEPT SELECT uuid FROM revocations ORDER BY uuid"  # all tables are sorted by their key, so EXCEPT is one merge
 )
 _UNVERIFIED_OF = (
     "SELECT uuid FROM ({}) k WHERE NOT EXISTS (SELECT 1 FROM readings WHERE uuid = k.uuid AND c IS NOT NULL)"
     " AND NOT EXISTS (SELECT 1 FROM nodes WHERE uuid = k.uuid AND retired IS NOT NULL)"
     " AND NOT EXISTS (SELECT 1 FROM tombstones WHERE uuid = k.uuid)"
-    " AND NOT EXISTS (SELECT 1 FROM revocations WHERE uuid = k.uuid) ORDER BY uuid"  # a look-up each: few are asked for
+    # one look-up per node, for a few nodes
+    " AND NOT EXISTS (SELECT 1 FROM revocations WHERE uuid = k.uuid) ORDER BY uuid"
 )
 
 
@@ -167,7 +168,7 @@ class Overview:
             )
             try:
                 origin = origin_of(unpacked(uuid, row[0]).blocks) if row is not None else None
-            except ValueError:  # whoever reads the datasheet itself reports the damage
+            except ValueError:  # reading the datasheet itself reports the damage
                 continue
             if origin is not None:
                 found[bytes(uuid)] = origin

@@ -189,21 +189,21 @@ class Pins:
         for entry in self._store.read(WhitelistEntry, f"SELECT * FROM whitelist WHERE {rows} ORDER BY uuid"):
             yield f"the whitelist entry of {entry.uuid.hex()}", entry.mac, "whitelist", _bound(entry)
 
-    # -- a board that was replaced under its UUID ------------------------------------------------------------------
+    # -- a board that was replaced, with the same UUID -------------------------------------------------------------
 
     def unpin(self, uuid: bytes) -> None:
         """Forget the pinned key; the link keys that are held still belong to the board that had it."""
         self._row_macs.require()
-        entry, node = self.row(uuid), self._nodes.get(uuid)  # whatever it is: it is forgotten
+        entry, node = self.row(uuid), self._nodes.get(uuid)  # also with a wrong MAC, since the row is removed
         pinned = entry.fingerprint if entry is not None else None
         if not is_whole(pinned) and node is not None and node.point is not None:
             pinned = _wholer(pinned, keys.fingerprint(node.point))
-        if pinned is not None and is_whole(pinned):  # with a board that was never met no key was agreed
+        if pinned is not None and is_whole(pinned):  # otherwise no board was met, and so no key was agreed on
             self._keys.set_former(uuid, pinned)
             self._datasheets.drop_draft(uuid)  # it may hold the old board's calibration
         with self._store.together():
             self._nodes.unpin(uuid)
-            self._datasheets.forget_reading(uuid)  # of the board that it was
+            self._datasheets.forget_reading(uuid)  # it is of the old board
 
     def epoch_to_exceed(self, uuid: bytes, pinned: str | None) -> int:
         """Return the epoch that an agreement must exceed: the active key's, 0 for a board that never agreed it."""

@@ -34,10 +34,10 @@ from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
     from teds_provision.protocol.plant import event, signer
-else:  # cryptography: not for commands that only list
+else:  # imports cryptography, which commands that only list do not need
     event = late("teds_provision.protocol.plant.event")
 
-_MIN_FINGERPRINT_PREFIX: Final = 16  # what people are shown
+_MIN_FINGERPRINT_PREFIX: Final = 16  # as many digits as users see
 _DIGITS: Final = 16
 _SHOWN: Final = 5
 _tombstone = attrgetter(*(column.name for column in fields(Tombstone)))
@@ -209,7 +209,7 @@ class Policy:
         """Return the keys of the other stations that count here, by fingerprint."""
         return {record.fingerprint: record.point for record in self.trusted("station")}
 
-    # -- nodes that are refused ------------------------------------------------------------------------------------
+    # -- refused nodes ---------------------------------------------------------------------------------------------
 
     def revocations(self) -> list[RevocationRecord]:
         """Return the deny list, by UUID."""

@@ -62,9 +62,9 @@ class RowMacs:
         if self._keyed is None:
             self.require()
         assert self._keyed is not None
-        whole = kind.encode() + b"\0"  # in one piece: there may be 100,000
+        whole = kind.encode() + b"\0"  # concatenated at once for speed: there may be 100,000 rows
         for value in values:
-            if value is None:  # not the empty text: a length that no value has
+            if value is None:  # marks None by a length that no value has, to distinguish it from ""
                 whole += b"\xff\xff\xff\xff"
             else:
                 octets = value if type(value) is bytes else value.encode()  # type: ignore[union-attr]

@@ -45,7 +45,7 @@ def _channels_of(name_or_path: str, home: Path) -> Mapping[int, ChannelProfile]:
         return {}
 
 
-@lru_cache(maxsize=64)  # a plant has a thousand nodes and a dozen types
+@lru_cache(maxsize=64)  # a plant has a thousand nodes, but a dozen types
 def _read(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> Mapping[int, ChannelProfile]:
     """Read the channels of a profile; again each second, as the profiles that it extends may change."""
     return {channel.number: channel for channel in load_profile(path, folders).channels}

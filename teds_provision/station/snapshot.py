@@ -15,7 +15,8 @@ from teds_provision.station.store.connection import as_store_failure
 from teds_provision.station.store.sqlite import FILE_NAME, sqlite3
 
 _COUNTED: Final = ("whitelist", "nodes", "keys", "trust")
-_DAMAGE: Final = (11, 26)  # SQLITE_CORRUPT, SQLITE_NOTADB (sqlite.org, rescode): for --help sqlite3 is not loaded
+# SQLITE_CORRUPT, SQLITE_NOTADB (sqlite.org, rescode); written out, so that --help need not load sqlite3
+_DAMAGE: Final = (11, 26)
 
 
 class Relation(Enum):
@@ -39,9 +40,9 @@ def place(copy: Station, home: Path) -> None:
         with whole_draft(path, replace=False) as (draft, _):
             store = copy._store
             with closing(sqlite3.connect(draft)) as target, store._lock, store._translated():
-                target.execute("PRAGMA journal_mode=OFF")  # a draft that fails goes whole
+                target.execute("PRAGMA journal_mode=OFF")  # needs no rollback: a failed draft is deleted
                 store._connection.backup(target)
-            for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
+            for left in ("-wal", "-shm"):  # files of a former store, which SQLite would replay into this one
                 path.with_name(FILE_NAME + left).unlink(missing_ok=True)
     except (OSError, sqlite3.Error) as error:
         raise as_store_failure(error, path) from error
@@ -58,7 +59,7 @@ def set_aside(home: Path) -> Path:
     path = home / FILE_NAME
     name = f"{FILE_NAME}.damaged-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}"
     try:
-        for end in ("-wal", "-shm", ""):  # the store last: as long as it has its name, the same command goes on
+        for end in ("-wal", "-shm", ""):  # the store last: until it is renamed, the same command can be repeated
             with suppress(FileNotFoundError):
                 path.with_name(FILE_NAME + end).rename(path.with_name(name + end))
     except OSError as error:

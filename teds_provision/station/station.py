@@ -70,7 +70,7 @@ from teds_provision.vault.master import MasterKeys
 if TYPE_CHECKING:
     from teds_provision.vault import master_socket, selection
 else:
-    # sockets and processes: `nodes` and others open no vault
+    # Sockets and processes; commands such as `nodes` open no vault.
     master_socket, selection = late("teds_provision.vault.master_socket"), late("teds_provision.vault.selection")
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
@@ -194,7 +194,7 @@ class Station:
     ) -> None:
         self.close()
 
-    # -- who it is -------------------------------------------------------------------------------------------------
+    # -- identity --------------------------------------------------------------------------------------------------
 
     @property
     def home(self) -> Path:
@@ -236,7 +236,7 @@ class Station:
     def _opened(self) -> Vault:
         if self._vault is None:
             self._store.drain()
-            with self._opening:  # of several threads one asks for the passphrase
+            with self._opening:  # only one thread asks for the passphrase
                 if self._vault is None:
                     keystore = self.identity.keystore
                     self.adopt(selection.open_vault(self.home, self.id, keystore, self._ask, use_agent=self.use_agent))
@@ -245,7 +245,7 @@ class Station:
 
     def adopt(self, vault: Vault) -> None:
         """Use a vault that is open; raises StoreChangedError if the store no longer matches it."""
-        self._vault = vault  # row MACs are made and checked with it
+        self._vault = vault  # needed to make and check row MACs
         try:
             self._check_row_macs(vault)
         except BaseException:
@@ -255,9 +255,7 @@ class Station:
     def _check_row_macs(self, vault: Vault) -> None:
         try:
             self.identity.unlocked(vault)
-        except (
-            UnknownMasterKeyError
-        ):  # between the opening of the vault and this look another command changed the master key
+        except UnknownMasterKeyError:  # another command changed the master key after the vault was opened
             if not vault.refresh():
                 raise
             self.identity.unlocked(vault)
@@ -278,7 +276,7 @@ class Station:
                 vault.reread()
                 return vault
             except VaultChangedError as changed:
-                if self.identity.master in vault.masters():  # handed over by the command that made it
+                if self.identity.master in vault.masters():  # the command that made the new key handed it over
                     return vault
                 try:
                     opened = selection.open_vault(
@@ -347,7 +345,7 @@ class Station:
         """Yield the whole store as it is at one moment (see :mod:`teds_provision.station.store.dump`)."""
         return dump(self._store)
 
-    # -- one command at a time, all or nothing, and who did it -----------------------------------------------------
+    # -- locks, transactions, and the actor of the audit log -------------------------------------------------------
 
     @contextmanager
     def lock(self, command: str, notice: Callable[[str], object] | None = None) -> Iterator[None]:
@@ -383,14 +381,14 @@ class Station:
                 with self._store.transaction(later=later):
                     if run is not None:
                         if later:
-                            run.last = self._store.commits_not_waited_for + 1  # this one, when it is committed
-                        while run.joining:  # one that fails is dropped, and fails this step
+                            run.last = self._store.commits_not_waited_for + 1  # the number of this commit
+                        while run.joining:  # a failing step is removed, and makes this one fail
                             step = run.joining.pop(0)
                             step.write()
                             joined.append(step)
                     yield
             except BaseException:
-                if run is not None:  # undone with this step
+                if run is not None:  # they are rolled back with this step
                     run.joining = [*joined, *run.joining]
                 raise
             for step in joined:
@@ -410,7 +408,7 @@ class Station:
                     self._runs.now = None
                     run.background.close()
         finally:
-            self._store.flush(run.last)  # not what other threads have written since: they see to it themselves
+            self._store.flush(run.last)  # only this run's commits: other threads flush their own
 
     def run_in_background(self, step: Callable[[], object]) -> None:
         """Take a durable step while the node is talked to: in a :meth:`run` by its own thread, elsewhere at once.
@@ -425,7 +423,7 @@ class Station:
             return
 
         def taken() -> None:
-            self._runs.now = run  # in the thread that takes it
+            self._runs.now = run  # this thread runs the step
             try:
                 step()
             finally:
@@ -550,10 +548,10 @@ def initialise(
 
 # A new master key: every link key in the store is wrapped again, and the old master key is deleted.
 #
-# Each part is durable before the next begins, so a run that was cut is carried on by the next one: the new master key,
-# a note in the store that says which one it is, the keys (one transaction), the old master keys, the end of the note.
-# At no moment is there a key in the store that the vault does not open: another process that opened the vault before
-# sees by the note that it has to open it again (:class:`.node_keys.NodeKeys`).
+# Each part is durable before the next begins, so that a later run can continue an interrupted one: the new master key,
+# a note in the store with its number, the keys (one transaction), deletion of the old master keys, removal of the note.
+# At each moment, the vault opens all keys in the store. A process that opened the vault before learns from the note
+# that it must read it again (:class:`.node_keys.NodeKeys`).
 
 
 @dataclass(frozen=True)
@@ -572,9 +570,11 @@ def rewrap(station: Station) -> RewrapResult:
     vault, identity = station.vault, station.identity
     vault.refresh()
     if identity.rewrapping != vault.masters()[-1]:
-        if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
+        # otherwise an earlier run made a new one and was cut before the note
+        if vault.masters()[-1] <= identity.master:
             vault.add_master()
-        master_socket.hand_over(station.home, vault.master_keys())  # before a row needs the new one
+        # other processes need the new one before any row does
+        master_socket.hand_over(station.home, vault.master_keys())
         identity.begin_rewrapping(vault.masters()[-1])
     damaged = 0
 
@@ -583,7 +583,7 @@ def rewrap(station: Station) -> RewrapResult:
         context = node_key_context(station.id, record.uuid, record.epoch, record.slot)
         try:
             key = vault.unwrap(record.wrapped, context=context)
-        except VaultError:  # lost before this run: no reason to keep an old master key for the others
+        except VaultError:  # damaged before this run; that is no reason to keep the old master key
             damaged += 1
             return record.wrapped
         return vault.wrap(key, context=context)

@@ -194,7 +194,7 @@ def _spec(access_code: int, path: _Path) -> FieldSpec | None:
     return spec
 
 
-# What another calibration changes in the readings of a channel.
+# How another calibration changes the readings of a channel.
 
 CURVE_FIELDS: Final = frozenset({"CalInput", "Coefs", "Method", "ZeroOffset", "SIConvrt"})
 """Fields that make the curve: they are reported as one change."""

@@ -213,7 +213,7 @@ def _meets(term: Term, has: float, channel: Channel) -> bool:
     difference = term.what in ("range", "uncertainty")
     asked = term.unit.difference_to_si(term.value) if difference else term.unit.to_si(term.value)
     slack = ROUNDING * max(abs(has), abs(asked))
-    # That a range reaches down to a value: its low end is not above it. All other bounds read as they are written.
+    # A range reaches down to a value if its low end is not above it; other bounds are compared as written.
     match term.operator:
         case ">=":
             return has >= asked - slack

@@ -26,7 +26,7 @@ from teds_provision.teds.curve import FLOAT32_STEP, Curve, CurveChannel, channel
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 
-# The single checks of the guard on a curve that can be computed.
+# Single checks of the guard for curves that can be computed.
 
 Raised = tuple[str, Literal["error", "warning"], str]
 """Code, severity, message."""
@@ -139,7 +139,8 @@ def _limits(curve: Curve) -> Iterator[Raised]:
     else:
         low, high, tolerance = channel.low, channel.high, channel.tolerance
         values, names = curve.result, ("low limit", "high limit")
-        if channel.full_turn:  # wrapped, no value is beyond a limit; but a calibration that goes round twice is wrong
+        # wrapped values are never beyond a limit, but a calibration over more than one turn is wrong
+        if channel.full_turn:
             low = float(values.min())
             high, tolerance = low + TURN, 2 * tolerance
             names = "low limit", "end of the turn that the channel spans"
@@ -332,7 +333,7 @@ def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw:
     if raw[0] < before[0] - step or raw[1] > before[1] + step:
         return f"it was made for {spans[0]}, and this channel gives {spans[1]}"
     if now.actuator or max(abs(raw[0] - before[0]), abs(raw[1] - before[1])) <= step:
-        return ""  # points beyond the range were taken when it was made for this very one
+        return ""  # points beyond the range were measured for this very range
     part = next((given for given in calibration.inputs if given.channel == now.number), calibration.inputs[0])
     if part.boundaries[0] < raw[0] - step or part.boundaries[-1] > raw[1] + step:
         return f"it covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g}, and this channel gives {spans[1]}"
@@ -450,7 +451,7 @@ class _Judge:
             return None
         had = self._channel(self.number, self.old)
         if (had.units, had.actuator) != (channel.units, channel.actuator):
-            return None  # the node was of another type
+            return None  # the node had another type
         try:
             calibration = self._calibration(decode(octets), self.old)
         except BadDataError:

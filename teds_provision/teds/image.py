@@ -138,7 +138,7 @@ def _hex(value: object, name: str) -> bytes:
         raise BadDataError(f'"{name}" is not a string of hex digits.') from error
 
 
-# One TEDS with its place, and cutting a run of framed TEDS apart.
+# One TEDS with its place, and splitting a sequence of framed TEDS.
 
 
 class TedsBlock(NamedTuple):

@@ -26,7 +26,7 @@ from teds_provision.teds.origin import read_origin
 from teds_provision.teds.sheet import channel_from, described
 from teds_provision.teds.units import WrittenUnit, display_unit, format_value, name_of_units
 
-# The value of one field as people write it.
+# The value of a field as text for users.
 
 _DAY: Final = 86_400
 SHOWN_NUMBERS: Final = 8

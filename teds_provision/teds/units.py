@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pint
 
 
-# The units people use every day: SI exponents and the way into SI; the tests hold them against ``pint``.
+# Everyday units: SI exponents and the conversion to SI; tests compare them with ``pint``.
 
 PRODUCT, RATIO, LOG_PRODUCT, LOG_RATIO, DIGITAL, ARBITRARY = range(6)
 
@@ -91,7 +91,7 @@ NAME_OF: Final = {units: name for name, units in NAMED.items()}
 _DEGREE = math.pi / 180
 _TURN = 2 * math.pi
 ROWS: Final = (
-    # spellings, name in NAMED, scale, offset
+    # Spellings, name in NAMED, scale, offset.
     ("degree degrees deg °", "rad", _DEGREE, 0.0),
     ("degree/s deg/s °/s", "rad/s", _DEGREE, 0.0),
     ("turn revolution rev", "rad", _TURN, 0.0),
@@ -275,7 +275,7 @@ def _ratio(text: str) -> WrittenUnit | None:
     return WrittenUnit(text, Units(RATIO, **exponents), above.scale / below.scale)
 
 
-# Names, products, quotients, one power each: nothing whose value is computed, as 9**9**9 would be.
+# Names, products, quotients, and one power each. Nothing that pint would compute, such as 9**9**9.
 _PLAIN_POWER: Final = r"(?:\s*(?:\^|\*\*)\s*\(?[-+]?[0-9]{1,3}(?:\.[05]|/2)?\)?|[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]{1,4})?+"
 _PLAIN_NAME: Final = r"[^\W\d_]\w*+|[°%Ω]\w*+"
 _PLAIN_UNIT: Final = re.compile(
@@ -307,7 +307,7 @@ def _compound(text: str) -> WrittenUnit | None:
             return None
         for base in UNIT_PARTS:
             out[base] += power * getattr(units, base)
-        if named is not None:  # its offset is left out: in a product a temperature is a difference
+        if named is not None:  # without its offset: in a product, a temperature is a difference
             scale *= named[1] ** float(power)
     _representable(text, out)
     return WrittenUnit(text, from_exponents(PRODUCT, out), scale)
@@ -316,7 +316,7 @@ def _compound(text: str) -> WrittenUnit | None:
 def _factors(text: str) -> list[tuple[re.Match[str], int]] | None:
     """Return each factor of a product with its side (1 above, -1 below); None if it is no product."""
     upper, slash, lower = text.partition("/(")
-    if slash and (not lower.endswith(")") or "/" in lower):  # one denominator in brackets, and nothing after it
+    if slash and (not lower.endswith(")") or "/" in lower):  # only one denominator in brackets, at the end
         return None
     factors: list[tuple[re.Match[str], int]] = []
     for part, side in ((upper, 1), (lower[:-1], -1)) if slash else ((upper, 1),):
@@ -353,10 +353,10 @@ def _by_pint(text: str) -> WrittenUnit:
         parsed = registry.parse_units(text)
         scale = registry.Quantity(1.0, parsed).to_root_units()
         zero = registry.Quantity(0.0, parsed).to_root_units()
-    except Exception as error:  # pint raises its own, tokenizer's and arithmetic errors on a text that is no unit
+    except Exception as error:  # for text that is not a unit, pint raises its own, tokenizer's and arithmetic errors
         raise _unknown(text) from error
     exponents = _exponents(scale.u._units)
-    light = ("steradian", "lumen", "lux")  # pint counts these as rad²
+    light = ("steradian", "lumen", "lux")  # pint defines these with rad²
     steradians = sum((n for name, n in _exponents(parsed._units).items() if name.endswith(light)), Fraction(0))
     exponents["radian"] = exponents.get("radian", Fraction(0)) - 2 * steradians
     out = dict.fromkeys(UNIT_PARTS, Fraction(0)) | {"steradians": steradians}
@@ -369,7 +369,7 @@ def _by_pint(text: str) -> WrittenUnit:
                 hint='Use "arbitrary" for what has no SI unit, "count" for a number, "digital" for bits.',
             )
     _representable(text, out)
-    grams = float(out["kilograms"])  # pint's root unit is the gram
+    grams = float(out["kilograms"])  # pint's base unit is the gram
     offset = float(zero.m)
     return WrittenUnit(
         text, from_exponents(PRODUCT, out), (float(scale.m) - offset) * 1000.0**-grams, offset * 1000.0**-grams
@@ -397,7 +397,7 @@ def _in_symbols(text: str) -> str:
     written = _WORD.sub(lambda word: _symbol(word[0].lower()) or word[0], text).replace("-", "*").strip()
     try:
         parses = written in NAMED or written in TABLE or written in SPECIAL or _compound(written) is not None
-    except BadDataError:  # an exponent that no TEDS can hold
+    except BadDataError:  # an exponent out of range for a TEDS
         return ""
     return written if parses and written != text else ""
 
@@ -440,7 +440,7 @@ def _product(units: Units) -> str:
     return f"{above or '1'}/{below[0] if len(below) == 1 else '(' + '·'.join(below) + ')'}"
 
 
-# Interpretation of physical units (IEEE 1451.0-2007, table of the field): as a unit is shown, as plain numbers are.
+# Interpretation of physical units (IEEE 1451.0-2007, table of the field): formats for units and for plain numbers.
 _INTERPRETATIONS: Final = {
     0: ("{0}", ""),
     1: ("{0}/{0}", "ratio"),

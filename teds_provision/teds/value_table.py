@@ -15,7 +15,7 @@ from teds_provision.teds.codec.model import DecodedTeds
 if TYPE_CHECKING:
     from xml.sax import saxutils
 else:
-    saxutils = late("xml.sax.saxutils")  # it loads urllib and http, and few datasheets have a value table
+    saxutils = late("xml.sax.saxutils")  # it imports urllib and http, and few datasheets have a value table
 
 MOST_ROWS: Final = 64
 _MOST_COMMENT: Final = 200

@@ -51,7 +51,7 @@ def _flow(data: bytes, status: int) -> str:
     return f"flow control: {_FLOWS[status]}, block {data[1]}, gap {data[2]}" if status < len(_FLOWS) else _NONE
 
 
-# NFC frames in words: blocks of ISO/IEC 14443-4 with their APDU, and the commands of Type 2 tags.
+# NFC frames as text: blocks of ISO/IEC 14443-4 with their APDU, and the commands of Type 2 tags.
 
 _APDUS: Final = {0xA4: "SELECT", 0xB0: "READ BINARY", 0xD6: "UPDATE BINARY"}
 _ANSWER_OCTETS: Final = 16
@@ -90,7 +90,7 @@ def _asked(octets: bytes) -> str:
             return f"READ from page {octets[1]}"
         case 0xA2, 6:
             return f"WRITE of page {octets[1]}"
-        case 0x00, size if size >= 4 and octets[1] in _APDUS:  # a PC/SC reader is given the APDU alone
+        case 0x00, size if size >= 4 and octets[1] in _APDUS:  # PC/SC readers get the bare APDU
             return _APDUS[octets[1]]
     return ""
 

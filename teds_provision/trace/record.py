@@ -57,7 +57,7 @@ class Record:
         return members
 
 
-# A trace as lines: one JSON object each, the first says what the file is. Whoever is killed leaves whole lines.
+# A trace is JSON lines; the first one describes the file. A process that is killed leaves whole lines.
 
 FORMAT: Final = "teds-trace/1"
 

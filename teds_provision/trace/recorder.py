@@ -121,7 +121,7 @@ class Recorder:
         self._notify(f"The trace {self.path} ends here: {self.failure}. The command goes on.")
 
 
-# Reading a trace, in either form; a capture of CAN frames by another program is read as well.
+# Reads traces in either form, and captures of CAN frames by other programs.
 
 _MOST_OCTETS: Final = 1 << 30
 _HEAD_OCTETS: Final = 64

@@ -27,7 +27,7 @@ from teds_provision.vault.hardening import harden
 
 if TYPE_CHECKING:
     import ctypes
-else:  # for the process that holds: commands that only ask do not wait for it
+else:  # only the process that holds the secret needs ctypes; the commands that ask it start faster without
     ctypes = late("ctypes")
 
 SOCKET: Final = "agent.sock"
@@ -66,7 +66,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
         raise VaultError("unlock requires Linux: this system does not identify the peer of a socket.")
     lock(home)
     package = Path(__file__).parents[2]
-    # -P and an appended folder: neither the folder that the user is in, nor ours, comes before Python's own modules.
+    # -P and an appended path: neither the user's working directory nor our folder comes before the standard library.
     code = f"import sys; sys.path.append({str(package)!r}); from teds_provision.vault import agent; agent.main()"
     command = [sys.executable, "-P", "-c", code, str(home.resolve()), str(seconds)]
     process = subprocess.Popen(
@@ -75,7 +75,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         cwd="/",
-        start_new_session=True,  # the terminal's Ctrl-C and its end are not for it
+        start_new_session=True,  # Ctrl-C and the end of the terminal must not reach the agent
     )
     assert process.stdin is not None
     assert process.stdout is not None
@@ -114,10 +114,11 @@ def user_at(line: socket.socket) -> int:
     return int(uid)
 
 
-# The process itself: started by ``unlock``, gone when its time is over. The secret comes through stdin straight
-# into one page of memory that is locked (mlock), left out of dumps and of children, and filled with zeros at the end.
-# The process cannot be traced by others of the same user and leaves no core dump. Its time runs on while the machine
-# sleeps.
+# The agent process: started by ``unlock``, it exits when its time is over.
+#
+# The secret comes through stdin straight into one page of memory that is locked (mlock), excluded from core dumps and
+# child processes, and zeroed at the end. Other processes of the same user cannot trace the agent, and it leaves no core
+# dump. Its time goes on while the machine sleeps.
 
 _LOOK_SECONDS: Final = 20.0
 """A sleeping machine stops the wait, not the clock: so often it is looked at again."""
@@ -137,7 +138,7 @@ def main() -> None:
         listener = listen_alone(path, 16)
         ours = path.stat().st_ino
         os.write(1, b"ready\n")
-        # Let go of whoever started this: no pipe of theirs stays open
+        # Close the pipes to the process that started this one.
         null = os.open(os.devnull, os.O_RDWR)
         for descriptor in (0, 1, 2):
             os.dup2(null, descriptor)
@@ -204,7 +205,7 @@ def _answer(line: socket.socket, page: LockedPage, until: float) -> bool:
         return True
     request, left = line.recv(1), until - _now()
     if left <= 0 or request == END:
-        page.wipe()  # before the stream ends, which tells the other side that it is gone
+        page.wipe()  # before the connection closes: to the other side, that means that the secret is gone
         return False
     if request == SECRET:
         line.sendall(page.view())

@@ -42,7 +42,7 @@ def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
     pem = _encrypted_pem(key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption()), passphrase)
     try:
         write_new(path, pem, failure=VaultError)
-    except UsageError as taken:  # this command's exit code is that of the vault since version 0.1
+    except UsageError as taken:  # since version 0.1 this command fails with the exit code of the vault
         raise VaultError(taken.message, hint=taken.hint) from None
 
 
@@ -66,7 +66,7 @@ def read_ca(path: Path, passphrase: str) -> bytes:
         raise WrongPassphraseError(
             f"Wrong passphrase for {path}.", hint="Try again. If it is right, the file is damaged."
         ) from None
-    except Exception as error:  # the library names unsupported ciphers and curves by many classes
+    except Exception as error:  # for unsupported ciphers and curves the library raises many exception classes
         raise VaultError(f"{path} contains an unsupported kind of key.") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(key.curve, ec.SECP256R1):
         raise VaultError(f"{path} contains no P-256 key.", hint="Give the file that trust ca export wrote.")

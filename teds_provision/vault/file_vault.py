@@ -66,9 +66,9 @@ class FileVault(SoftwareVault):
         content = read_sealed(path)
         _require_store(content, store_id, path)
         opened = None if held is None else unseal_with(held, content, context=_context(store_id))
-        if opened is None:  # nothing is held, or the passphrase is another one by now
+        if opened is None:  # no secret is held, or the passphrase has changed
             passphrase, asked = ask("Passphrase of this station's keys", False), content
-            content = read_sealed(path)  # as it is now: a person may have thought for an hour
+            content = read_sealed(path)  # read again: the user may have taken an hour to answer
             try:
                 opened = unseal(passphrase, content, context=_context(store_id))
             except WrongPassphraseError:

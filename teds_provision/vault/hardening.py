@@ -16,11 +16,11 @@ _PR_SET_DUMPABLE: Final = 4
 def harden() -> None:
     """Forbid core dumps, and on Linux tracing by processes of the same user; a system that cannot is left as it is."""
     with suppress(OSError, ValueError, ModuleNotFoundError):
-        import resource  # Windows has none, and writes no core dumps
+        import resource  # not on Windows, which writes no core dumps
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if sys.platform == "linux":
-        import ctypes  # some milliseconds that lists of nodes need not pay
+        import ctypes  # saves some milliseconds in commands such as `nodes`
 
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)

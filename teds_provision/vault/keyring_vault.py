@@ -139,7 +139,7 @@ def _viable() -> Iterator[tuple[str, KeyringBackend]]:
         module, _, attribute = name.rpartition(".")
         try:
             kind = getattr(import_module(module), attribute)
-            usable = kind.priority > 0  # asks the platform, and raises where the backend cannot work
+            usable = kind.priority > 0  # asks the platform, and raises if the backend cannot work
             backend = kind()
         except Exception:  # noqa: BLE001  backends raise anything: RuntimeError, D-Bus, GLib and import errors
             continue
@@ -184,7 +184,7 @@ def _probe(name: str, backend: KeyringBackend) -> None:
     try:
         _set(name, backend, entry, secrets.token_urlsafe(24))
     finally:
-        with suppress(Exception):  # a probe that cannot be deleted holds nothing
+        with suppress(Exception):  # a probe that cannot be deleted contains no secret
             backend.delete_password(SERVICE, entry)
 
 

@@ -62,7 +62,7 @@ class MasterSocket:
         with suppress(OSError):
             self._path.unlink()
         with suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread, which close() alone does not
+            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread; close() alone does not
         self._listener.close()
         self._thread.join(_SECONDS)
 

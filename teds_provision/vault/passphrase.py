@@ -184,6 +184,6 @@ def _text(octets: bytes) -> str:
 
 def _octets(text: str) -> bytes:
     octets = base64.b64decode(text, validate=True)
-    if _text(octets) != text:  # spare bits that are not zero
+    if _text(octets) != text:  # the unused bits of the last digit are not zero
         raise ValueError
     return octets

@@ -70,11 +70,11 @@ class Pkcs11Vault:
         with exclusive(where.module_path):
             if restored is not None:
                 _save(home, store_id, _backed_up(restored, store_id, session), replace=False)
-            elif not (home / FILE_NAME).exists():  # else another process was quicker
+            elif not (home / FILE_NAME).exists():  # otherwise another process created it first
                 station = _find_or_make(session, store_id, where, "station")
                 ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
                 _save(home, store_id, _Content(station, ca, MasterKeys.generate()), replace=False)
-            opened = _load(home, store_id, session)  # the token has to open what was just sealed to its key
+            opened = _load(home, store_id, session)  # check that the token can open what was just sealed to its key
         return cls(home, store_id, where, session, opened)
 
     @classmethod
@@ -84,7 +84,7 @@ class Pkcs11Vault:
         Raises UsageError (URI), WrongPassphraseError, VaultError (module, token, key or file missing or changed).
         """
         where = Pkcs11Uri.parse(uri)
-        _read(home, store_id)  # before anyone is asked for a PIN
+        _read(home, store_id)  # fails before the user is asked for a PIN
         session = _open_session(where, ask, write=False)
         with exclusive(where.module_path):
             opened = _load(home, store_id, session)
@@ -147,7 +147,8 @@ class Pkcs11Vault:
 
         def set_pin() -> None:
             self.refresh()
-            # counted first: a cut in between makes others ask again, the other way round would cost them a try
+            # Count first: after a cut in between, other processes only ask again; the other way round, they would lose
+            # a try.
             self._replace(replace(self._content, pins=self._content.pins + 1))
             with exclusive(self._module_path):
                 self._session.set_pin(old, new)
@@ -394,11 +395,11 @@ def _parsed(octets: bytes, store_id: str, path: str) -> dict[str, Any]:
     return members
 
 
-# One process at a time at the risky moments of a token: loading the module, logging in, making keys.
+# One process at a time while a token is at risk: loading the module, logging in, making keys.
 #
 # SoftHSM rewrites its token file at every login, and a process that loads it then sees no token, or fails with
-# CKR_GENERAL_ERROR (SoftHSMv2#757). The lock is one per user and module, as several homes may share a token; processes
-# of other users and other programs are not held off, for these there is one more try.
+# CKR_GENERAL_ERROR (SoftHSMv2#757). The lock is one per user and module, as several homes may share a token. Other
+# users' processes and other programs do not take this lock; because of them, one more try is made.
 
 _WAIT_SECONDS = 30.0
 _POLL_SECONDS = 0.02

@@ -53,7 +53,7 @@ class TokenKey:
         A shorter secret would be the *last* octets of x on some modules and the first on others; key derivation is
         ours, outside, because tokens lack HKDF. Raises BadDataError for a bad point, VaultError.
         """
-        public_key(peer)  # a token need not look whether a point is on the curve
+        public_key(peer)  # tokens are not required to check that a point is on the curve
         return guarded(lambda: self._derive(peer))
 
     def _derive(self, peer: bytes) -> bytes:
@@ -75,7 +75,7 @@ class TokenKey:
 
         try:
             return derive(peer)
-        except (MechanismParamInvalid, DomainParamsInvalid):  # a module that wants the point in DER
+        except (MechanismParamInvalid, DomainParamsInvalid):  # some modules need the point in DER
             return derive(_POINT_DER + peer)
 
     def __repr__(self) -> str:
@@ -147,7 +147,8 @@ class TokenSession:
         from pkcs11.util.ec import encode_named_curve_parameters
 
         half = {Attribute.CLASS: ObjectClass.PUBLIC_KEY, Attribute.LABEL: label, Attribute.ID: identifier}
-        for left_over in list(self._session.get_objects(half)):  # of a run that died while the token made the pair
+        # left by a run that was cut while the token made the pair
+        for left_over in list(self._session.get_objects(half)):
             left_over.destroy()
         curve = self._session.create_domain_parameters(
             KeyType.EC, {Attribute.EC_PARAMS: encode_named_curve_parameters("secp256r1")}, local=True
@@ -228,7 +229,7 @@ def find_token(uri: Pkcs11Uri) -> Token:
         library = guarded(lambda: pkcs11.lib(uri.module_path))
         tokens = guarded(lambda: [token for token in library.get_tokens() if _fits(uri, token)])
     except VaultError as failure:
-        if type(failure.__cause__) is not pkcs11.PKCS11Error:  # a return code of the module, not the loader's word
+        if type(failure.__cause__) is not pkcs11.PKCS11Error:  # with a return code, the module itself was loaded
             raise
         raise VaultError(
             f"The PKCS #11 module {uri.module_path} cannot be loaded.",

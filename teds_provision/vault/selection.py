@@ -15,7 +15,7 @@ from teds_provision.vault.passphrase import PRODUCT, Costs
 
 if TYPE_CHECKING:
     from teds_provision.vault import file_vault, keyring_vault, pkcs11
-else:  # a station has one of them, and argon2, keyring and python-pkcs11 are heavy
+else:  # a station uses only one of them, and argon2, keyring and python-pkcs11 are slow to import
     file_vault, keyring_vault = late("teds_provision.vault.file_vault"), late("teds_provision.vault.keyring_vault")
     pkcs11 = late("teds_provision.vault.pkcs11")
 
@@ -86,7 +86,7 @@ def create_vault(
 
     vault, why = _create(home, store_id, keystore, asked, costs, restored, with_ca=with_ca)
     if not with_ca and restored is None:
-        vault.drop_ca()  # one that was made a moment ago and never used
+        vault.drop_ca()  # the CA key was just made and has not been used
     _opened[home.resolve(), store_id, keystore if keystore and vault.kind == "pkcs11" else vault.kind] = vault
     return vault, why
 
@@ -104,12 +104,12 @@ def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent:
         try:
             vault.refresh()
             return vault
-        except VaultChangedError as failure:  # under another passphrase: that one has to be asked for
+        except VaultChangedError as failure:  # the passphrase was changed, so ask for the new one
             changed = failure
     try:
         _opened[place] = vault = _open(home, store_id, keystore, ask, use_agent=use_agent)
     except WrongPassphraseError:
-        if changed is not None:  # it was the right one before
+        if changed is not None:  # the passphrase was right until it was changed
             raise changed from None
         raise
     return vault
@@ -161,7 +161,7 @@ def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool
         if pin is not None:
             try:
                 return pkcs11.Pkcs11Vault.open(home, store_id, keystore, _holding(pin, ask))
-            except WrongPassphraseError:  # the PIN is another one by now: a second try could lock the token
+            except WrongPassphraseError:  # the PIN was changed: a second try could lock the token
                 agent.lock(home)
                 raise
         return pkcs11.Pkcs11Vault.open(home, store_id, keystore, ask)

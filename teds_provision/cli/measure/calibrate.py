@@ -32,7 +32,7 @@ from teds_provision.links import LinkSettings
 from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.calibration.model import METHODS
 
-_NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value, and no option
+_NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value, not an option
 
 
 @click.group(

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from teds_provision.measure.running.measurement import MeasurementEnd
     from teds_provision.measure.running.measurement_job import MeasurementJob
     from teds_provision.measure.sinks.mcap.recover import RecoveryResult
-else:  # loads the sinks and numpy
+else:  # imports the sinks and numpy
     measure_view = late("teds_provision.cli.measure.measure_view")
 
 MOST_NAMED = 3
@@ -299,7 +299,7 @@ def _propose_rate(app: App, job: MeasurementJob, uuids: Sequence[bytes]) -> None
 def _at_rate(job: MeasurementJob, uuids: Sequence[bytes], rate: float) -> str:
     """Return this very command with another rate."""
     words = sys.argv[1:]
-    if "measure" not in words:  # it was called by a program
+    if "measure" not in words:  # called from Python, not from the command line
         words = ["measure", *([job.kept.group] if job.kept.group else [uuid.hex() for uuid in uuids])]
     kept, skip = [], False
     for word in words:

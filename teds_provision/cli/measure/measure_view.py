@@ -58,7 +58,7 @@ class StdoutEvents(ThreadedSink):
         self._stop = stop
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
         self._last: dict[str, tuple[str, str]] = {}
-        self._printed: dict[str, str] = {}  # the state of each node in its last line
+        self._printed: dict[str, str] = {}  # the last printed state of each node
         self._events: list[dict[str, Any]] = []
         self._guard = threading.Lock()
 
@@ -88,7 +88,8 @@ class StdoutEvents(ThreadedSink):
             self._put_out(b"".join(as_line(line) for line in data_lines(item, self._facts)))
         elif isinstance(item, NodeReport):
             self._put_out(as_line(status_line(item)))
-            if self._printed.get(item.uuid) == "running" and item.state == "refused":  # behind its last values
+            # only now, so that it follows the node's last values
+            if self._printed.get(item.uuid) == "running" and item.state == "refused":
                 self._put_out(as_line({"event": "left", "uuid": item.uuid, "why": item.why}))
             self._printed[item.uuid] = item.state
         elif isinstance(item, tuple):
@@ -106,7 +107,7 @@ class StdoutEvents(ThreadedSink):
             sys.stdout.buffer.write(octets)
             sys.stdout.buffer.flush()
         except BrokenPipeError:
-            self._stop.set()  # no reader any more: end in order, so that the nodes are released
+            self._stop.set()  # the reader is gone: end in order, so that the nodes are released
             raise
 
     def _finish(self) -> None:

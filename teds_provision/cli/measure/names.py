@@ -77,7 +77,7 @@ def reset_name(app: App, node: str, channel: int | str, *, dry_run: bool) -> Non
     """
     station = app.station()
     uuid = _who(station, node)
-    if isinstance(channel, str):  # a number may be one that the datasheet has no longer
+    if isinstance(channel, str):  # a number may refer to a channel that the datasheet no longer has
         channel = _require_channel(station, uuid, channel)
     if not dry_run:
         _change(app, station, uuid, channel, None)
@@ -147,7 +147,8 @@ def _channels(station: Station) -> list[tuple[bytes, int, measure.blocks.Channel
         if image is None:
             continue
         sheet, judged = teds.sheet.Sheet.from_image(image), provisioning.readings.verdict_of(station, record.uuid)
-        unsigned = judged is not None and judged.verified.verdict == "unsigned"  # it is called what it calls itself
+        # an unsigned node has only the name from its own TEDS
+        unsigned = judged is not None and judged.verified.verdict == "unsigned"
         name = sheet.meta.name if unsigned else record.name or ""
         for channel in sheet.channels:
             facts = measure.blocks.ChannelFacts(

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from teds_provision.measure.recordings.source import Entry, Recording
     from teds_provision.measure.recordings.summary import RecordingSummary
 else:
-    measure_view = late("teds_provision.cli.measure.measure_view")  # numpy and the sinks
+    measure_view = late("teds_provision.cli.measure.measure_view")  # imports numpy and the sinks
 
 SHOWN = 20
 
@@ -104,7 +104,7 @@ def _span(channel: Mapping[str, Any], facts: ChannelFacts | None) -> str:
     low, unit = measure_view.value_text(channel["lowest"], facts)
     high, _ = measure_view.value_text(channel["highest"], facts)
     plain = [f"{measure_view.in_peoples_units(channel[end], facts)[0]:.6g}" for end in ("lowest", "highest")]
-    # at the end of a full turn 360 is 0; as the upper end of a span it is 360, unless all values are at that end
+    # A full turn is shown as 0. As the upper end of a span it is shown as 360, unless both ends are equal.
     return f", {low} to {high if low != plain[0] else plain[1]} {unit}".rstrip()
 
 

@@ -191,7 +191,7 @@ def _mode(console: Console, found: OperationReply, names: dict[int, str], power:
     "teds-provision set hand opening 50 --unit mm --can socketcan:can0",
     "teds-provision set 91aa 1 -0.5 --can socketcan:can0",
     name="set",
-    context_settings={"ignore_unknown_options": True},  # -0.5 is a value, and no option
+    context_settings={"ignore_unknown_options": True},  # -0.5 is a value, not an option
 )
 @click.argument("node", metavar="UUID")
 @click.argument("channel", type=ChannelName())
@@ -235,7 +235,7 @@ def set_value(
         actuator = measure.held_actuator.HeldActuator(trusted, channel, unit=unit, dead_man=dead_man)
         driven = actuator.channel
         _require_unit(app, driven, value, unit)
-        actuator.octets_of(value)  # the limits, before anything is claimed
+        actuator.octets_of(value)  # checks the limits before the channel is claimed
         station.audit("set", uuid, "begun", channel=driven.number, value=value, unit=actuator.unit.text)
         with actuator:
             until = None if hold is None else time.monotonic() + hold

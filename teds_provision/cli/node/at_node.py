@@ -273,7 +273,7 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 @pass_app
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Permanently change a node's CAN address, 1 to 239: by tap, or in a session if its key is held."""
-    del yes  # the old address can be given back the same way
+    del yes  # not needed: the change can be undone with the same command
     done = provisioning.address.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
     node = done.uuid.hex()
     if done.changed is None:

@@ -35,7 +35,7 @@ from teds_provision.teds.certificate import CertificateReference
 if TYPE_CHECKING:
     from teds_provision.cli import terminal_operator
     from teds_provision.provisioning.write import WriteResult
-else:  # loads the steps
+else:  # imports the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
 
 
@@ -49,7 +49,8 @@ def order_options(function: Function) -> Function:
         item, trusted, due = rest.pop("item"), rest.pop("trust_dcc"), rest.pop("due")
         line = rest.get("line")
         elsewhere = rest.get("batch") is not None or (line is not None and line.names_boards)
-        if calibration is None and (item is not None or due is not None) and not elsewhere:  # named there
+        # with --batch or a line's job, calibrations are named there
+        if calibration is None and (item is not None or due is not None) and not elsewhere:
             raise UsageError("--item and --due belong to a calibration.", hint="Add --calibration FILE.")
         channel, file = calibration or (None, None)
         order = provisioning.build.BuildOrder(
@@ -202,7 +203,7 @@ def sign(
 
     If content, key epoch and signer are unchanged, the existing signature is reused.
     """
-    del yes  # a signature uses up a sequence number, nothing else
+    del yes  # not needed: a signature only uses up a sequence number
     station = app.station()
     done = provisioning.sign.sign_at(
         station,
@@ -384,7 +385,7 @@ def list_(app: App) -> None:
 @pass_app
 def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Drop a node's draft; the datasheet on the node is not affected."""
-    del yes  # what was built can be built again
+    del yes  # not needed: the draft can be built again
     done = provisioning.datasheet_history.drop_draft(app.station(), uuid, dry_run=dry_run)
     node = done.uuid.hex()
     if done.draft is None:

@@ -155,7 +155,7 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
             return provisioning.agree.reset_node(station, node, provisioning.identify.identify(station, node))
     except (LinkError, PolicyError) as error:
         if isinstance(error, FrozenError) or provisioning.conversation.is_busy(error):
-            raise  # it answers: once it is free it signs its reset, and --force would record less than can be had
+            raise  # the node answers and will sign its reset once it is free; --force would record less
         if not force and not app.interactive:
             first = "Bring the node within reach" if isinstance(error, LinkError) else error.hint.rstrip(".")
             error.hint = (

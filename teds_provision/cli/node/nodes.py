@@ -44,7 +44,7 @@ class NodeView(Protocol):
 
 
 NODE_VIEWS: Final[Hook[NodeView]] = Hook("cli.node.views")
-_FIRST = 200  # the rows that decide how wide each column is
+_FIRST = 200  # column widths are computed from this many rows
 _NAME_COLUMNS = 24
 _GAP = "  "
 
@@ -94,7 +94,7 @@ def nodes(
     if fits is not None:
         show_fits(app, station, fits, found)
         return
-    if not app.json and form in (None, "table"):  # what scripts read stays in the order of UUIDs
+    if not app.json and form in (None, "table"):  # output for scripts remains sorted by UUID
         names = {record.uuid: record.name for record in station.nodes.all()}
         found = sorted(found, key=lambda uuid: by_name(names.get(uuid), uuid.hex()))
     described = _with_views(station, (node.to_json() for node in inventory(station, found)))
@@ -134,7 +134,7 @@ _FIELDS = (
 )  # fmt: skip
 
 
-# Title, the text of a cell, and the order in which columns are dropped on a narrow terminal (0: never).
+# Title, the function that makes a cell, and the order in which columns are dropped on a narrow terminal (0: never).
 _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str], int], ...] = (
     ("UUID", lambda node: node["uuid"], 0),
     ("name", lambda node: _cut(shown(node["name"]), _NAME_COLUMNS), 1),
@@ -172,7 +172,7 @@ def _fitting(widths: list[int]) -> list[int]:
     room = shutil.get_terminal_size().columns
     remarks = len(_COLUMNS) - 1
     while len(kept) > 1:
-        # the last column may be cut at the edge, if a useful part of it is seen
+        # The last column may be cut at the edge if enough of it can be read.
         needed = sum(min(widths[number], 24) if number == remarks else widths[number] for number in kept)
         if needed + len(_GAP) * (len(kept) - 1) <= room:
             break
@@ -234,7 +234,7 @@ def _link_keys(node: dict[str, Any]) -> list[str]:
     return keys or ["none"]
 
 
-# Title and text of each line about one node; what is empty is left out, a list gives a line for each.
+# Title and text of each line about one node; empty lines are left out, and a list gives one line per element.
 _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("UUID", lambda node: node["uuid"]),
     ("name", lambda node: node["name"] or ""),

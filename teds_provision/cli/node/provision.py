@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from teds_provision.provisioning.batch_sheet import BoardResult, SheetRow
     from teds_provision.provisioning.operator import Operator
     from teds_provision.provisioning.provision import ProductionLine, ProvisionResult
-else:  # loads the steps
+else:  # imports the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
 
 
@@ -113,7 +113,7 @@ def provision(
     --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
     --calibration, --name) changes, or what you confirm after seeing the changes.
     """
-    adopt = adopt and bool(options_given("adopt"))  # a setting of that name is meant for ncap run
+    adopt = adopt and bool(options_given("adopt"))  # a setting of that name is for ncap run only
     order = replace(order, choose=app.chooses_item(), adopt=adopt)
     if order.adopt and batch is not None:
         raise UsageError("The sheet already defines what each board gets.", hint="Drop --adopt.")
@@ -131,7 +131,7 @@ def provision(
                 hint="Many boards: whitelist add, agree, update --match EXPR IMAGE, provision. Plan: update --dry-run.",
             )
         image = firmware_image.load_firmware_image(firmware, firmware_key)
-        links = replace(links, via_chosen=True)  # as what follows: the board is tapped, unless a bus is named
+        links = replace(links, via_chosen=True)  # the board is tapped for this too, unless a bus was named
         request = replace(request, node=_with_firmware(app, base, links, uuid, image, reporter, yes=yes))
     boards = provisioning.batch.BatchRun(base, links, request, reporter, line=run)
     for warning in boards.warnings:
@@ -141,8 +141,8 @@ def provision(
     elif dry_run:
         _print_plan(app, boards.plan())
     elif request.several:
-        boards.unlock()  # asked for before the screen shows instructions
-        begun = None if several else reporter  # with several readers one board may be begun while another one ends
+        boards.unlock()  # asks for the passphrase before the screen shows instructions
+        begun = None if several else reporter  # with several readers, one board may start while another one ends
         with screen_for(app, boards, begun) as screen:
             person = terminal_operator.TerminalOperator(app, yes=yes, strangers=not everything, several=True)
             _many(app, boards, person, screen, totals=everything or batch is not None or boards.of_a_job)
@@ -182,7 +182,7 @@ def _one(app: App, boards: BatchRun, operator: Operator) -> None:
     try:
         done = boards.one(operator)
     except provisioning.build.UnrequestedChangeError as error:
-        # With --json the changes are beside the error, so that the caller can name them.
+        # With --json the changes are printed with the error, so that a caller can pass them as options.
         changes = [change.text for change in error.changes]
         app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
@@ -295,7 +295,8 @@ def _print_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any
     """Print a board's result as a JSON line, or for people: UUID, time and row of the sheet; ``line`` has its unit."""
     if board.done is not None:
         failure = board.failure
-        if failure is not None:  # an authentic board can fail: its type requires a calibration, a channel read nothing
+        # an authentic board can fail: without a calibration that its type requires, or if a channel read nothing
+        if failure is not None:
             line["failure"] = problem_of(failure)
         seconds = round(board.seconds, 3)
         _print_result(app, board.done, warn=warn, row=board.row, time=board.time, seconds=seconds, **line)
@@ -400,7 +401,7 @@ def _summary(
     print_table(console, table)
 
 
-# The operator's screen during a batch, legible from two metres: what to do now, PASS or FAIL, n of 50, the last five
+# The operator's screen during a batch, readable at two metres: the next action, PASS or FAIL, n of 50, the last five
 # boards.
 
 _BELL: Final = "\a"
@@ -522,7 +523,8 @@ class OperatorScreen:
     """Redrawn when a board is begun and when it ends, on stderr; ``live_line`` removes what runs below it."""
 
     def __init__(self, console: Console, boards: BatchState, live_line: Callable[[], None] = lambda: None) -> None:
-        self.shows_boards = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
+        # redirected output gets one line per board, beside the screen on stderr
+        self.shows_boards = sys.stdout.isatty()
         self._console, self._boards, self._live_line = console, boards, live_line
         self._last: deque[BoardResult] = deque(maxlen=_LAST)
         self._draw(">>> ", self._next())

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from teds_provision.teds.dcc.items import CertificateItem
     from teds_provision.teds.dcc.shown import ShownCertificate
 else:
-    bundles = late("teds_provision.protocol.handover.bundle")  # cryptography: only for a handover bundle
+    bundles = late("teds_provision.protocol.handover.bundle")  # imports cryptography: only for a handover bundle
     markup, rich_table = late("rich.markup"), late("rich.table")
 
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
@@ -60,7 +60,7 @@ _BAD_DATA = BadDataError.exit_code
 _POLICY = 6
 _MOST_PEM: Final = 1 << 20
 _CERTIFICATE: Final = b"digitalCalibrationCertificate"
-_CERTIFICATE_HEAD: Final = 8192  # a licence may stand before the root
+_CERTIFICATE_HEAD: Final = 8192  # a licence text may precede the root element
 
 
 @command(
@@ -199,7 +199,7 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
     app.emit(result, lambda console: console.print("\n".join(lines), markup=False))
 
 
-# For people: rich tables of fields, findings and what they mean.
+# Output for people: rich tables of fields and findings, with explanations.
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "note": "dim"}
 _PIPE_WIDTH = 200
@@ -335,7 +335,7 @@ def _heads(item: CertificateItem) -> tuple[str, str]:
     return escape(f"indication [{of}]" if of else "raw"), escape(value)
 
 
-# Files are read, recognized and described before anything is printed.
+# Read, recognize and describe all files before anything is printed.
 
 STDIN = "-"
 _HEAD_OCTETS: Final = 64
@@ -430,7 +430,7 @@ def load(name: str, edition: Edition | None = None, trusted: tuple[bytes, ...] =
 def _long_bundle(name: str) -> BundleHeader | None:
     """Return the header of a bundle that is longer than any file of TEDS, read piece by piece; else None."""
     try:
-        if name == STDIN or os.stat(name).st_size <= LIMITS.teds_file:  # a pipe has none, and is opened once
+        if name == STDIN or os.stat(name).st_size <= LIMITS.teds_file:  # a pipe has no size, and can be read only once
             return None
     except (OSError, ValueError):
         return None
@@ -453,7 +453,7 @@ def _no_teds(name: str, octets: bytes, why: str) -> BadDataError:
 
 def _of_file(name: str, kind: Kind | None, error: BadDataError) -> BadDataError:
     """Return the error of a file, with its name before it."""
-    if kind == "hex" and "Line 1 holds" in error.message:  # whatever is text and nothing else is taken for hex
+    if kind == "hex" and "Line 1 holds" in error.message:  # text of no other kind is tried as hex
         return BadDataError(
             f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
             f"{error.message[1:].rstrip('.')}).",
@@ -530,7 +530,7 @@ def guard_to_json(finding: GuardFinding) -> dict[str, Any]:
     }
 
 
-# With --json: one object with every TEDS of every file.
+# Output with --json: one object with every TEDS of every file.
 
 
 def to_json(files: Sequence[ShownFile]) -> dict[str, Any]:

@@ -170,7 +170,7 @@ def create(
     image = None
     if firmware is not None and firmware_key is not None:
         image = node_room.firmware.boot_loader.ImageSlots.create(folder, firmware, firmware_key).running
-    flash = made.load()  # what lies there: the same command once more finds the node that it made
+    flash = made.load()  # if the command is repeated, this is the node that it made before
     print_of_key = fingerprint(flash.node_key)
     channels: list[dict[str, object]] = [
         {
@@ -235,7 +235,7 @@ def _known_as(app: App, uuid: bytes) -> str | None:
     """Return what has a UUID already: a node of this home's station, or one on a link of its running ncap."""
     if not has_store(app.home):
         return None
-    with suppress(StoreError):  # a virtual node can be made beside a store that cannot be read
+    with suppress(StoreError):  # an unreadable store must not prevent a virtual node
         station = app.station()
         if station.overview.is_known(uuid):
             known = station.nodes.get(uuid)
@@ -371,7 +371,7 @@ def run(
             running.append(part)
         _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can", "ble") if links[kind]], source)
         lines.start()
-        running.insert(0, lines)  # the last to end: it reports that actuators are safe
+        running.insert(0, lines)  # ends last, because it reports that actuators are safe
         while not stop.wait(0.5):
             pass
     finally:
@@ -541,7 +541,7 @@ def _extras(node: VirtualNode, air: BleServer | None) -> ExtraRecords:
 
 # Virtual actuators report on stdout: at most twenty lines a second each, and always the last state.
 #
-# ``time`` is when the state began, not when the line was printed, so it shows how long a dead-man took.
+# ``time`` is when the state began, not when the line was printed, so that it shows how long a dead-man switch took.
 
 _EVERY_SECONDS = 0.05
 _MOST_LINES = 1000
@@ -632,7 +632,7 @@ class ActuatorLines:
                 self._told[uuid, channel] = state
                 try:
                     self._print_state(uuid, state)
-                except OSError:  # no reader, or the disk is full: the node runs on
+                except OSError:  # the reader is gone or the disk is full: the node goes on
                     self._stop.set()
                     return
 

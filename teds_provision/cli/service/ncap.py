@@ -50,10 +50,10 @@ else:
     tokens = late("teds_provision.ncap.web.tokens")
 
 
-MOST: Final = 1000  # lines that may wait for a reader
+MOST: Final = 1000  # lines that may wait until stdout accepts them
 _MOST_NAMED: Final = 5
 _MOST_REASONS: Final = 5
-LEAVING: Final = 2.0  # seconds for them to leave at the end
+LEAVING: Final = 2.0  # seconds to print them at the end
 _MOMENTS: Final = frozenset({"time", "since", "started", "until", "tapped"})
 """Members of events and of the status that are moments."""
 _NO_LINK = "No link is configured, so no board is found. To add one: teds-provision ncap run --can socketcan:can0"
@@ -160,16 +160,16 @@ def run(
         unknown = match.unknown_type(station)
         if unknown:
             app.warn(f"Nothing is measured until a node of that type comes: {unknown}.")
-    station.unlock()  # no passphrase prompt later
+    station.unlock()  # so that no passphrase is asked for later
     lines = DaemonLog(app)
     try:
         with tracing(trace) as opened:
             service_run.run(station, replace(wanted, trace=opened), lines.write_event)
-    except TedsProvisionError:  # its message comes after the last event
+    except TedsProvisionError:  # the caller prints its message, after the last event
         lines.end()
         raise
     if not lines.end():
-        os._exit(0)  # all has ended in order; a line without a reader would delay the end of the process for ever
+        os._exit(0)  # everything ended in order; the blocked writer thread would delay the exit for ever
 
 
 class DaemonLog:

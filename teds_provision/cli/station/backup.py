@@ -134,7 +134,7 @@ def restore(
         plan = {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True}
         app.emit(plan | {"age_days": content.age_days()}, f"Plan: rebuild this station in {app.home}.")
         return
-    if recovery_key is not None:  # sealing needs only the public key: the fingerprint identifies the owner
+    if recovery_key is not None:  # a bundle needs only the public key, so its fingerprint identifies the owner
         app.confirm(f"Is this your station, and should its keys be kept in {_named(wanted)}?", yes=yes)
     done = rebuild(app.home, content, app.ask_secret, keystore=keystore)
     if done.set_aside is not None:

@@ -206,7 +206,7 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
     except click.BadParameter as error:
         raise UsageError(f"{name}: {error.message.rstrip('.')}.") from error
     if option_.name == "can":
-        spec.parse_spec(value)  # else every command would fail at it
+        spec.parse_spec(value)  # a wrong value would make every command fail
     return read if isinstance(read, bool | int | float) else value
 
 

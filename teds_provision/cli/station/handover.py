@@ -136,8 +136,8 @@ def export_keys(
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
-        station.unlock()  # now: nobody is asked for a passphrase while the store is held
-    state = station.version()  # before the plan: what changes while it is made is not overlooked either
+        station.unlock()  # before the lock: the store is not held while the user types a passphrase
+    state = station.version()  # before the plan, so that changes made during planning are noticed
     shown = plan_exports(station, order)
     outputs = outputs_of(output, len(shown)) if output is not None else []
     if dry_run:
@@ -148,7 +148,7 @@ def export_keys(
     app.note(_plan_text(shown, station))
     app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
     with station.lock("export-keys", app.note):
-        # A person may have taken minutes to answer. What they said yes to is done, or nothing is.
+        # The user may have taken minutes to answer: export exactly what was confirmed, or nothing.
         plans = shown if station.version() == state else plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         result = _result_of(plans, outputs, station)
@@ -271,7 +271,7 @@ def import_keys(
     with _bundle_file(file) as bundle:
         receipt = receipt or file.with_name(file.name + ".receipt")
         station.unlock()
-        state = station.version()  # before the plan: what changes while it is made is not overlooked either
+        state = station.version()  # before the plan, so that changes made during planning are noticed
         shown = plan_import(station, bundle)
         if dry_run:
             app.emit({**import_plan(shown), "receipt": None, "plan": True}, import_text(station, shown))
@@ -283,9 +283,9 @@ def import_keys(
         with station.lock("import-keys", app.note):
             plan = shown if station.version() == state else plan_import(station, bundle)
             require_as_shown(plan, shown)
-            # an ImportResult: before, or meanwhile by another command
+            # An ImportResult: this bundle was imported before, perhaps meanwhile by another command.
             done = plan if isinstance(plan, ImportResult) else import_bundle(station, plan)
-            if not holds(receipt, done.receipt + b"\n"):  # the same bundle once more: its receipt may lie there
+            if not holds(receipt, done.receipt + b"\n"):  # the bundle may have been imported before, with its receipt
                 write_new(receipt, done.receipt + b"\n")
     outcomes: list[dict[str, Any]] = []
     if links_given(ctx) if prove is None else prove:

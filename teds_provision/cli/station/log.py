@@ -27,7 +27,7 @@ from teds_provision.station.store.audit import AuditEntry, AuditFilter, AuditVer
 if TYPE_CHECKING:
     from teds_provision.trace import recorder
     from teds_provision.trace.record import Record
-else:  # the help of this command does without
+else:  # not needed for this command's help
     recorder = late("teds_provision.trace.recorder")
 
 

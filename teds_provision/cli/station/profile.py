@@ -160,7 +160,7 @@ def check(app: App, names: tuple[str, ...]) -> None:
             {"name": path.stem, "file": str(path), "ok": not wrong, "problems": list(map(_problem, problems))}
         )
         for problem in problems:
-            app.note(f"{problem.severity}: {problem}")  # not with --json, where they stand in the object
+            app.note(f"{problem.severity}: {problem}")  # only without --json, whose object contains them
     if errors:
         more = f" ({len(errors) - 1} more, listed above)" if len(errors) > 1 and not app.json else ""
         raise BadDataError(f"{errors[0]}{more}")
@@ -238,7 +238,7 @@ def new(
     elif source is not None and mapping is not None:
         rules = read_file(mapping).decode(errors="replace")
         text = profile_from_xml(read_file(Path(source)), rules, name=name, file=source, by=str(mapping))
-        parse_profile(text, name)  # the XML's content is checked like any profile
+        parse_profile(text, name)  # checks the XML's content like any profile
     elif extends is not None:
         base = find_profile(extends, default_folders(app.home)).stem
         text = (

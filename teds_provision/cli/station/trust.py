@@ -103,7 +103,7 @@ def add(
 def _add(app: App, station: Station, chosen: list[Candidate]) -> None:
     fresh = [candidate for candidate in chosen if not candidate.known]
     if fresh:
-        station.unlock()  # whom this station trusts is sealed under its vault
+        station.unlock()  # trust records are sealed by the vault
     with station.lock("trust add", app.note):
         added = handover_trust.add(station, chosen)
     result = {"trusted": [_record(candidate.record) for candidate in chosen], "added": added}
@@ -322,7 +322,7 @@ def export(app: App, file: Path) -> None:
     The vault keeps it until "trust ca drop".
     """
     station = app.station()
-    station.use_agent = False  # who walks up to an unlocked desk shall not take the CA key along
+    station.use_agent = False  # a passer-by at an unlocked desk must not be able to export the CA key
     vault = station.vault
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):

@@ -47,17 +47,17 @@ def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
             {"keystore": kind, "rewrapped": 0, "plan": True}, f"Plan: change the passphrase of the {kind} keystore."
         )
         return
-    station.use_agent = False  # who walks up to an unlocked desk shall not lock its owner out
+    station.use_agent = False  # a passer-by at an unlocked desk must not be able to change the passphrase
     opened = station.vault
 
     def ask(prompt: str, confirm: bool) -> str:
         new = confirm and new_passphrase_fd is not None
         return read_line(new_passphrase_fd or 0) if new else app.ask_new(prompt) if confirm else app.ask_secret(prompt)
 
-    set_it = opened.new_passphrase(ask)  # no other process waits for the store while a person types
+    set_it = opened.new_passphrase(ask)  # before the lock: other processes do not wait while the user types
     with station.lock("vault passphrase", app.note):
         opened.refresh()
-        agent.lock(app.home)  # what is held open is of the old one
+        agent.lock(app.home)  # the agent holds the old secret
         set_it()
         station.audit("vault", None, "new passphrase")
     app.emit(
@@ -80,7 +80,7 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
     Anyone with an old copy of the store and the old master key still has the node keys of that time; if that matters,
     rotate them (agree UUID --rotate). If interrupted, run the same command again to continue.
     """
-    del yes  # nothing here is lost: the old master key goes when nothing needs it any more
+    del yes  # not needed: the old master key is kept until every key was wrapped again
     station = app.station()
     kind = station.identity.keystore.partition(":")[0]
     if dry_run:
@@ -138,7 +138,7 @@ def unlock(app: App, span: str) -> None:
     if not opener:
         raise UsageError("The token has its own PIN pad, so there is nothing to keep in memory.")
     with station.lock("unlock", app.note):
-        opened.refresh()  # an old passphrase is not held, and an old PIN costs no try
+        opened.refresh()  # notices a changed passphrase or PIN, so that no old one is held and no PIN try is lost
         agent.start(app.home, kind, opener, int(seconds))
         station.audit("vault", None, "unlocked", seconds=int(seconds))
     until = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%SZ")

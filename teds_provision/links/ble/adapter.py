@@ -80,7 +80,7 @@ class Adapter:
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
         def detected(device: BLEDevice, advertisement: AdvertisementData) -> None:
-            # BlueZ merges the filters of all programs, and keeps UUIDs that a device had earlier: look again
+            # BlueZ merges the filters of all programs and keeps the UUIDs that a device had earlier, so check again.
             if SERVICE in (uuid.lower() for uuid in advertisement.service_uuids):
                 at = time.monotonic()
                 self._seen[device.address.upper()] = (device, at)
@@ -94,7 +94,7 @@ class Adapter:
         finally:
             try:
                 await scanner.stop()
-            except Exception as error:  # bleak and D-Bus raise what they like; the scan is over either way
+            except Exception as error:  # bleak and D-Bus raise many classes; the scan has ended anyway
                 trouble = ble_errors.adapter_trouble(error, self.spec.text)
                 if trouble is not None:
                     raise trouble from error

@@ -13,7 +13,7 @@ from teds_provision.links.ble import ble_errors
 if TYPE_CHECKING:
     import asyncio
 else:
-    asyncio = late("asyncio")  # a machine without D-Bus is not asked
+    asyncio = late("asyncio")  # not imported on a machine without D-Bus
 
 _SECONDS: Final = 5.0
 _SYSTEM_BUS: Final = "unix:path=/var/run/dbus/system_bus_socket"

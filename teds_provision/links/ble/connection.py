@@ -109,7 +109,7 @@ class BleConnection:
     async def _connect(self) -> None:
         await self.disconnect()
         if not await self._client_with_service():
-            # a stale GATT cache, as after a firmware update: have BlueZ forget the node, once
+            # The GATT cache may be stale, as after a firmware update: have BlueZ forget the node, once.
             client, self._client = self._client, None
             if client is not None:
                 with suppress(Exception):
@@ -129,7 +129,7 @@ class BleConnection:
     async def _client_with_service(self) -> bool:
         """Connect, and subscribe; return False if the node's service is missing."""
         client = await self._connected()
-        # bleak reports its own retries to the disconnected callback too, before connect() has returned
+        # Before connect() returns, bleak calls the disconnected callback for its own retries too: discard those events.
         self._empty()
         if any(client.services.get_characteristic(uuid) is None for uuid in (ble.WRITE, ble.NOTIFY)):
             return False

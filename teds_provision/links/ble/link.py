@@ -14,7 +14,7 @@ from teds_provision.links.ble.connection import BleConnection, ConnectionLostErr
 from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
-# The one asyncio loop of a Bluetooth port, in a thread: bleak runs in it, all else calls into it.
+# The one asyncio loop of a Bluetooth port, in its own thread: bleak runs there, and other threads call into it.
 
 Result = TypeVar("Result")
 _END_SECONDS: Final = 3.0
@@ -127,7 +127,7 @@ class BleLink:
                 return self._loop.run(self.connection.exchange(transaction, frame, REPLY_SECONDS))
             except ConnectionLostError as lost:
                 last = lost
-                # nothing was sent without a connection: an adapter that is still busy is no try
+                # A busy adapter does not count as a try, because without a connection nothing was sent.
                 tries += not (isinstance(lost, NotConnectedError) and self.connection.was_up)
                 self._notice(Notice("retry", f"BLE: {str(lost).rstrip('.')}. Connecting again"))
                 time.sleep(pause)

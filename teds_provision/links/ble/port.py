@@ -29,10 +29,10 @@ from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.can_frames import read_ble_frame
 
-# Which node was met at which Bluetooth address, kept from command to command (operation.md section 7). A hint.
+# A cache, from command to command, of the Bluetooth addresses at which nodes were met (operation.md section 7).
 #
-# A node keeps its address until it is reset, so a node that is named is looked for there first, and twenty others are
-# not asked. The file lies in the user's cache folder; a cache that cannot be read or written harms nothing.
+# A node keeps its address until it is reset, so a search for one node begins there and does not connect to twenty
+# others. The file is in the user's cache folder; errors of reading or writing it are ignored. Its contents are hints.
 
 FILE: Final = "ble-addresses.json"
 MOST: Final = 10_000
@@ -124,9 +124,9 @@ class BlePort(MeasuringLink):
         self._connections: dict[str, BleConnection] = {}
         self._known = RememberedNodes(cache_file())
         self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
-        self._streams: set[tuple[int, int]] = set()  # numbers of connection and stream
+        self._streams: set[tuple[int, int]] = set()  # (connection number, stream number)
         self._heard = self._closed = False
-        self.lost = 0  # data messages that were dropped for lack of time
+        self.lost = 0  # data messages dropped because the queue was full
         self._transaction = secrets.randbelow(1 << 16)
         self._lock = threading.Lock()
 
@@ -250,7 +250,7 @@ class BlePort(MeasuringLink):
                 contact = self._ask(address, _anyone, notice, reported)
                 asked[address] = time.monotonic()
                 if contact is not None:
-                    if not in_use:  # there may be twenty: each is connected again when its turn comes
+                    if not in_use:  # there may be twenty: each is connected again for its turn
                         contact.link.close()
                     found[address] = contact
             if found and (self.spec.address or time.monotonic() >= enough):
@@ -289,7 +289,7 @@ class BlePort(MeasuringLink):
                 if stop.is_set():
                     return
 
-    # -- the inside ------------------------------------------------------------------------------------------------
+    # -- internals -------------------------------------------------------------------------------------------------
 
     def _candidates(self, wanted: Callable[[Identity], bool], until: float) -> Iterator[str]:
         """Yield addresses to ask until ``until``: known ones first, then those that advertise, each at intervals."""

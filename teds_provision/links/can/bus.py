@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     import can
 
 
-# Our own frames, returned by an interface that cannot distinguish them: udp_multicast, SocketCAN.
+# Our own frames, as interfaces return them that do not mark them: udp_multicast, SocketCAN.
 #
-# A frame is taken for our own once for each time that it was sent, within three seconds.
+# A received frame counts as an echo once for each time that it was sent, for three seconds.
 
 _SECONDS: Final = 3.0
 _KEPT: Final = 4096
@@ -48,7 +48,7 @@ class SentFrames:
         with self._lock:
             self._sent.setdefault(key, []).append(time.monotonic())
             self._sent.move_to_end(key)
-            if len(self._sent) > _KEPT:  # some were lost on their way back
+            if len(self._sent) > _KEPT:  # some echoes were lost
                 self._sent.popitem(last=False)
 
     def discard_echo(self, frame: Frame) -> bool:
@@ -127,7 +127,7 @@ class Bus:
         self._descriptor = _descriptor(self._bus)
         self._clock_is_ours = clock_is_ours(spec)
         self._pacer = Pacer(spec.bitrate, spec.data_bitrate, spec.wire) if spec.pace else None
-        # SocketCAN marks every frame of this machine as sent here, also those of other programs: nodes beside us
+        # SocketCAN marks all frames of this machine as sent here, also those of nodes in other processes.
         self._marks_own = spec.interface != "socketcan"
         gives_back = not self._marks_own and "receive_own_messages" in dict(spec.options)
         back = spec.interface == "udp_multicast" and self._multicast is None
@@ -141,12 +141,13 @@ class Bus:
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkError."""
         multicast = self._multicast
-        datagram = written(frame) if multicast is not None else b""  # ready when the wire is free, as a controller's
+        # encoded first, so that it can leave at once when the wire is free, as from a controller's queue
+        datagram = written(frame) if multicast is not None else b""
         if self._pacer:
             self._pacer.wait(frame.identifier, frame.data, fd=frame.fd)
         if self._echoes:
             self._echoes.sent(frame)
-        if self._trace is not None:  # before it goes, so that no answer precedes it
+        if self._trace is not None:  # recorded before it is sent, so that its answer follows it in the trace
             self._trace.frame("can", "out", frame.data, identifier=frame.identifier, fd=frame.fd)
         if multicast is None:
             self._send_message(frame)
@@ -222,7 +223,7 @@ class Bus:
         try:
             message = self._bus.recv(timeout=max(0.0, seconds))
         except can.CanOperationError as error:
-            if "unpack" in str(error):  # udp_multicast: someone sent a datagram that is no CAN frame
+            if "unpack" in str(error):  # udp_multicast: a datagram that is not a CAN frame
                 return None
             self._failed("cannot be read", error)
         except (can.CanError, OSError, ValueError) as error:
@@ -316,13 +317,13 @@ def open_bus(spec: CanSpec, filters: Sequence[tuple[int, int]] = ()) -> can.BusA
             f"Cannot use CAN interface {spec.interface!r} here: {_reason(error)}.",
             hint=_driver(spec.interface) or known,
         ) from error
-    except TypeError as error:  # python-can's own word about a key that the interface does not take
+    except TypeError as error:  # python-can raises it for an unknown option of the interface
         raise _unknown_key(spec, error) from error
     except Exception as error:  # back ends raise what their driver, serial port or library raises
         raise _not_opened(spec, error) from error
     if spec.interface == "udp_multicast":
         _this_group_alone(bus)
-        # have the kernel hold more than the 256 frames of its default: 60 nodes answer one Identify with 300
+        # Enlarge the kernel's buffer, 256 frames by default: 60 nodes answer one Identify with 300.
         found = getattr(getattr(bus, "_multicast", None), "_socket", None)
         if isinstance(found, socket.socket):
             with contextlib.suppress(OSError):
@@ -465,7 +466,7 @@ def _reason(error: BaseException) -> str:
     """Return the innermost cause in one line: python-can hides it behind its own."""
     while error.__cause__ is not None:
         error = error.__cause__
-    if isinstance(error, NameError):  # what python-can would have loaded from the driver's library
+    if isinstance(error, NameError):  # a name that python-can would have loaded from the driver's library
         return "its driver library is not installed"
     text = str(error).strip().splitlines()
     return (text[0] if text else type(error).__name__).rstrip(".")

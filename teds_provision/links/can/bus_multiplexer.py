@@ -36,11 +36,11 @@ from teds_provision.links.can.presses import ButtonPressLog
 from teds_provision.links.can.transfer_pace import TransferPace
 from teds_provision.protocol.announce import Announce, is_announce
 
-# Who reads a bus: a loop of its own, or the thread that waits for a reply and so need not be woken by another.
+# Which thread reads a bus: a background loop, or the thread that waits for a reply.
 #
-# A reply that one thread reads and another one wants costs two wakings and a turn at the interpreter's lock, with every
-# flow control again. So the thread that waits reads by itself where it is the only one that waits. Where several do,
-# and when nobody has waited for a moment, the loop reads.
+# If one thread reads a reply that another one waits for, that costs two context switches and a GIL hand-over, and the
+# same for each flow control. So a thread that waits alone reads the bus itself. The loop reads if several threads wait,
+# and if none has waited for a moment.
 
 _ALIVE_SECONDS: Final = 0.25
 _SHORT_SLICE: Final = 0.02
@@ -79,8 +79,8 @@ class BusReader:
                 self._bus.wait(_ALIVE_SECONDS, self._woken)
                 self._read_all()
                 if self._bus.stamps_arrivals and not self._leaning:
-                    # Nobody waits for a reply: data gather, since a waking costs more than a frame. Who comes meanwhile
-                    # reads by itself, and the frames keep the kernel's time of arrival.
+                    # No thread waits for a reply: let data frames gather, since a context switch costs more than a
+                    # frame. A thread that starts to wait reads by itself, and the kernel stamps the time of arrival.
                     time.sleep(_NAP_SECONDS)
 
     def stop(self) -> None:
@@ -154,10 +154,10 @@ class BusReader:
         return True
 
 
-# Another base station under our own source address: noticed by frames that this process neither sent nor requested.
+# Detects another base station with our source address, from frames that this process neither sent nor requested.
 #
-# Two stations of one address get each other's replies, so that commands fail in ways that look like noise. Seen are
-# frames *from* our address that we did not send, and replies to us that we did not ask for.
+# Two stations with one address get each other's replies, so that commands fail in ways that look like noise. Two signs
+# count: frames *from* our address that we did not send, and replies to us that we did not request.
 
 _KEPT: Final = 64
 _FRAMES_NEEDED: Final = 2
@@ -211,7 +211,7 @@ def _of_a_station(identifier: int) -> bool:
     return identifier & 0x1FFFFF00 == FUNCTIONAL or addresses(identifier) is not None
 
 
-# The answers of all nodes to one functional Identify, put together from raw frames.
+# The answers of all nodes to one functional Identify, reassembled from raw frames.
 #
 # Many nodes answer at once, each with its own first frame, flow control and consecutive frames. Pure: frames in, frames
 # out.
@@ -270,7 +270,8 @@ class BroadcastReplies:
         partial = Reassembly.begin(node, frame)
         if partial is None:
             return None
-        if partial.too_long or partial.octets[0] != self.transaction:  # or late: of an Identify before this one
+        # too long, or a late answer to an earlier Identify
+        if partial.too_long or partial.octets[0] != self.transaction:
             return flow(node, self.own, OVERFLOW, fd=frame.fd)
         self._note_first_piece(node, frame.data)
         self._partial[node] = partial
@@ -398,7 +399,7 @@ class AddressPair:
     partial: Reassembly | None = None
     replies: BroadcastReplies | None = None
     heard_at: float = 0.0
-    gap: int = 0  # ms that the node is asked to leave between the frames of its reply
+    gap: int = 0  # ms between consecutive frames that the node is asked to keep
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
 
     @contextmanager
@@ -533,7 +534,8 @@ class BusMultiplexer:
     def address_pair(self, node: int, own: int | None = None) -> AddressPair:
         """Return the state for the node at this address; ``own`` is another station address, for testing a node."""
         pair = node, self.own if own is None else own
-        line = self._lines.get(pair)  # there already for all frames but the first: a new one costs more than a frame
+        # without the lock: a new pair costs more than a frame, and only the first frame needs one
+        line = self._lines.get(pair)
         if line is None:
             with self._lock:
                 line = self._lines.setdefault(pair, AddressPair(*pair))
@@ -559,7 +561,7 @@ class BusMultiplexer:
         """Return True if two nodes were heard under this address a short while ago, and no single one since then."""
         return time.monotonic() - self._clashes.get(node, -math.inf) < _CLASH_SECONDS
 
-    # -- the loop, and what runs in it -----------------------------------------------------------------------------
+    # -- the loop and its callbacks --------------------------------------------------------------------------------
 
     def _fail(self, failure: LinkError) -> None:
         self._failure = self._failure or failure
@@ -591,7 +593,7 @@ class BusMultiplexer:
         if announce is not None:
             self.presses.hear(announce)
             if announce.pressed:
-                return  # it has heard every question: nothing else follows from a button
+                return  # a press is not a restart, so pending commands are not affected
         node = frame.identifier & 0xFF
         self._announced[node] = time.monotonic()
         line = self._lines.get((node, self.own))
@@ -611,7 +613,8 @@ class BusMultiplexer:
                 self._first(line, frame)
             case 2:
                 self._consecutive(line, frame)
-            case 3 if line.transaction >= 0:  # no thread waits for others: they would only pile up
+            # flow control matters only to a thread that sends; otherwise the queue would grow
+            case 3 if line.transaction >= 0:
                 line.flows.put(frame.data)
 
     def _single(self, line: AddressPair, frame: Frame) -> None:
@@ -620,7 +623,7 @@ class BusMultiplexer:
             return
         if body[0] == line.transaction:
             line.events.put(ReplyEvent("whole", body, frame.at))
-            line.flows.put(b"")  # the waiter for a flow control has its answer
+            line.flows.put(b"")  # wakes a sender that waits for flow control
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
             self.conflicts.record_unsolicited(line.node)
 
@@ -643,7 +646,7 @@ class BusMultiplexer:
             line.events.put(ReplyEvent("begun"))
         elif self._gathered(line, frame, transaction):
             return
-        elif transaction in line.asked:  # a late reply: end it, so that the node is free for the next
+        elif transaction in line.asked:  # a late reply: end it, so that the node is free for the next command
             self._reply(flow(line.node, line.own, OVERFLOW, fd=frame.fd))
         else:
             self.conflicts.record_unsolicited(line.node)
@@ -673,7 +676,7 @@ class BusMultiplexer:
                 self._ask_on(line, fd=partial.fd)
             case "torn":
                 line.partial = None
-                self._reply(flow(line.node, line.own, OVERFLOW, fd=partial.fd))  # it need not send the rest
+                self._reply(flow(line.node, line.own, OVERFLOW, fd=partial.fd))  # the rest is not needed
                 line.events.put(ReplyEvent("torn"))
 
     def _gather(self, asked: PendingBroadcast, node: int, frame: Frame) -> None:
@@ -686,7 +689,8 @@ class BusMultiplexer:
         if node in gathering.clashes:
             self._clashes[node] = time.monotonic()
         elif node in gathering.answers and self._clashes.get(node, math.inf) < asked.began:
-            # One of the two has left, by its Claim: one alone answers here. If both do, it stands again.
+            # One of the two nodes gave up the address after a Claim, so only one answers here. If both do, the conflict
+            # is set again.
             del self._clashes[node]
         if before != (len(gathering.answers), len(gathering.conflicts)):
             asked.news.put(node)

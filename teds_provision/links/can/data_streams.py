@@ -49,7 +49,7 @@ class CanDataListener:
         messages, streams = [], self._streams
         for frame in self._listener.get_all(seconds):
             identifier = frame.identifier
-            stream = streams.get(identifier & _STREAM)  # an open one has a good address
+            stream = streams.get(identifier & _STREAM)  # only valid addresses are open
             if stream is None or (frame.at or math.inf) < stream.since:
                 continue
             octets = stream.assembly.add_segment(identifier >> 8 & 7, frame.data)

@@ -67,7 +67,8 @@ class CanDiscovery(Discovery):
         self.port = port
         self._announcers: deque[int] = deque(maxlen=LAST_ADDRESS)
         self._asked_at: dict[int, float] = {}
-        self._awaited: dict[int, deque[float]] = {}  # when a missing node (its CRC) was looked for because of Announces
+        # per missing node (CRC of its UUID): when Announces led to a search for it
+        self._awaited: dict[int, deque[float]] = {}
         super().__init__(port.place, sightings, poll)
 
     def _run(self) -> None:
@@ -76,7 +77,7 @@ class CanDiscovery(Discovery):
                 self._watch()
             except LinkError as failure:
                 self.failure = failure
-                self._round_begins()  # a waiter for the next round learns of the failure now
+                self._round_begins()  # so that a thread that waits for the next round gets this failure now
                 self._round_ends()
                 self._stop.wait(LEAST)
 
@@ -90,7 +91,7 @@ class CanDiscovery(Discovery):
                 soon = min(soon, self._heard(listener.get(LOOK)))
                 missing = self._presence.missing()
                 if missing and self._presence.gone != gone:
-                    soon = SOON  # one that goes does not wait for the pause that another one's absence has come to
+                    soon = SOON  # the pause has grown for another missing node; this one is looked for soon
                 wanted = self._asked.is_set() or time.monotonic() - pace.asked >= soon
                 if pace.is_due(wanted=wanted, missing=missing, poll=self._poll):
                     soon, gone = math.inf, self._presence.gone
@@ -107,7 +108,7 @@ class CanDiscovery(Discovery):
         if self._presence.is_awaited(announce):
             return SOON if self._believes(announce) else math.inf
         if self._presence.is_welcome(announce) and self._believes(announce):
-            self._ask_one(announce.address, PATIENCE)  # it alone: the answers of all would cost the others' data
+            self._ask_one(announce.address, PATIENCE)  # a broadcast's answers would delay the data of other nodes
             return math.inf
         if self._poll and announce.address not in self._announcers:
             self._announcers.append(announce.address)
@@ -129,7 +130,8 @@ class CanDiscovery(Discovery):
             address = self._announcers.popleft()
             if now - self._asked_at.get(address, -math.inf) >= EACH:
                 self._asked_at[address] = now
-                self._ask_one(address, PATIENCE, once=True)  # any device can announce: the limit holds for torn answers
+                # any device can send an Announce, so torn answers count too
+                self._ask_one(address, PATIENCE, once=True)
                 return
 
     def _ask(self) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-# A CAN frame, as the profile uses it.
+# A CAN frame as the profile uses it.
 
 
 @dataclass(frozen=True)
@@ -143,12 +143,12 @@ class Pair:
             return True
         kind = data[0] >> 4
         if kind == _CONSECUTIVE and data == self._last:
-            return True  # the same frame twice: an error in its last bit doubles a frame on CAN
+            return True  # the same frame twice: CAN repeats a frame after an error in its last bit
         if kind == _CONSECUTIVE and self.receiving and not self._has_its_length(data):
             return True
         self._last = data if kind == _CONSECUTIVE else b""
         if kind == _SINGLE and self.waits_for_flow:
-            self.stop_sending()  # a refusal in place of a flow control, or a new question: can-isotp would wait on
+            self.stop_sending()  # a refusal instead of flow control, or a new request; can-isotp would go on waiting
         if kind != _FLOW:
             self.speak(fd=frame.fd)
         if kind == _SINGLE and self._take_single(data):
@@ -263,7 +263,7 @@ def _parameters(fd: bool) -> dict[str, Any]:
         "rx_flowcontrol_timeout": _TIMEOUT_MS,
         "rx_consecutive_frame_timeout": _TIMEOUT_MS,
         "wftmax": 255,
-        "wait_func": _not_waited_for,  # the library tries it out, and so would sleep for each pair that is made
+        "wait_func": _not_waited_for,  # the default sleeps once when the library validates it, for each new pair
     }
 
 
@@ -309,10 +309,10 @@ def _tolerable_flow(data: bytes) -> bytes | None:
     return data[:2] + (b"\x7f" if reserved else data[2:3]) + data[3:]
 
 
-# The frames of one ISO-TP message, cut and put together: octets to frames and back (ISO 15765-2, section 9).
+# Segmentation and reassembly of one ISO-TP message: octets to frames and back (ISO 15765-2, section 9).
 #
-# What a base station uses for many nodes at once; a node uses can-isotp, above, so that each exchange is also one
-# between two implementations. Pure: no bus, no clock.
+# The station uses this for many nodes at once. A node uses can-isotp, above, so that each exchange is one between two
+# independent implementations. Pure: no bus, no clock.
 
 CONTINUE, WAIT, OVERFLOW = 0x30, 0x31, 0x32
 """First octet of a flow control frame."""

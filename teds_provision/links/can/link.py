@@ -122,9 +122,9 @@ class CanLink:
         self._bus, self._number, self._source = bus, number, source
         self.address = address
         self._last = 0
-        self.left = self.came = 0.0  # see links.ports.Timed
-        self.gap = 0  # see links.ports.Spaced
-        self.hopeless: Callable[[], bool] = lambda: False  # see links.ports.Abandons
+        self.left = self.came = 0.0  # see links.ports.DeadlineLink, TimestampedLink
+        self.gap = 0  # see links.ports.PacedLink
+        self.hopeless: Callable[[], bool] = lambda: False  # see links.ports.CancellableLink
         self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
 
     @property
@@ -152,8 +152,7 @@ class CanLink:
     def close(self) -> None:
         """Do nothing: CAN has no connection to end."""
 
-    # -- to try a node out, see links.ports.MultiStationLink
-    # ------------------------------------------------------------------
+    # -- for testing a node, see links.ports.MultiStationLink
 
     def from_station(self, source: int) -> CanLink:
         """Return a link to the same node from another station's address."""
@@ -188,7 +187,7 @@ class CanLink:
             until = time.monotonic() + _HELLO_SECONDS
             while time.monotonic() < until:
                 with suppress(Empty):
-                    if flow := bus.next_of(line.flows, 0.01):  # an empty one only means that a reply has come
+                    if flow := bus.next_of(line.flows, 0.01):  # an empty item only means that a reply has come
                         return flow
                 with suppress(Empty):
                     event = bus.next_of(line.events, 0.01)
@@ -262,7 +261,8 @@ class _Exchange:
                 busy = answered.reply[0][1:] == _BUSY and not self._prompt
                 if not busy or time.monotonic() - began >= BUSY_SECONDS:
                     return answered.reply
-                time.sleep(BUSY_PAUSE)  # it cannot take a long request now; the same octets again, no repetition
+                # the node cannot receive a long request yet: send the same octets again, not counted as a repetition
+                time.sleep(BUSY_PAUSE)
                 continue
             except _NoFlowControlError as lost:
                 refused += 1
@@ -276,7 +276,8 @@ class _Exchange:
             reply = self._reply(self._seconds * share)
             if reply is not None:
                 return reply
-            self._line.partial = None  # abandoned: a second beginning of the same reply is no doubled frame
+            # drops the partial reply, so that a repeated first frame is not taken for a doubled one
+            self._line.partial = None
             if time.monotonic() - began >= self._longest:
                 break
         raise self._failed()
@@ -368,7 +369,7 @@ class _Exchange:
                     if self._hopeless():
                         return None
                     continue
-                until = self._line.heard_at + self._gap  # it came on meanwhile, or is torn
+                until = self._line.heard_at + self._gap  # more frames came, or the reply is torn
                 self._torn = self._torn or until <= time.monotonic()
                 continue
             match event.kind:
@@ -382,7 +383,7 @@ class _Exchange:
                     self._torn = True
                     self._bus.note_loss()
                     return None
-                case _:  # the bus failed, or something announced itself at this address
+                case _:  # the bus failed, or a node announced itself at this address
                     self._bus.check()
                     if self._hopeless():
                         return None

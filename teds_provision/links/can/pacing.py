@@ -24,7 +24,7 @@ from teds_provision.lazy import late
 
 if TYPE_CHECKING:
     import fcntl
-else:  # recordings are read through this room if there is none
+else:  # without fcntl, this module is still imported to read recordings
     fcntl = late("fcntl")
 
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -50,7 +50,7 @@ def classic_bits(identifier: int, data: bytes) -> int:
     for value, width in ((crc >> 7, 8), (crc & 0x7F, 7)):
         more, state = _run(state, value, width)
         stuffed += more
-    # CRC, its delimiter, acknowledge, its delimiter, end of frame, intermission
+    # CRC, its delimiter, acknowledge, its delimiter, end of frame, intermission.
     return length + 8 * len(data) + stuffed + 15 + 1 + 1 + 1 + 7 + 3
 
 
@@ -63,7 +63,7 @@ def fd_seconds(identifier: int, data: bytes, bitrate: int, data_bitrate: int) ->
         more, state = _run(state, octet, 8)
         fast_stuffed += more
     crc = 17 if length <= 16 else 21
-    fixed = 1 + -(-crc // 4)  # one in front of the stuff count, one after every fourth bit
+    fixed = 1 + -(-crc // 4)  # one before the stuff count, one after every fourth bit
     fast_bits = 5 + 8 * length + fast_stuffed + 4 + crc + fixed
     slow_bits = slow + stuffed + 1 + 1 + 1 + 7 + 3
     return slow_bits / bitrate + fast_bits / data_bitrate
@@ -83,14 +83,14 @@ class Pacer:
 
     def wait(self, identifier: int, data: bytes, *, fd: bool) -> None:
         """Sleep until the frame is through, the last 30 µs by asking the clock."""
-        now = time.perf_counter()  # the frame begins now: what is reckoned below takes no time on a wire
+        now = time.perf_counter()  # the frame begins now: the computation below must not delay it
         sharp_timers()
         if fd:
             duration = fd_seconds(identifier, data, self._bitrate, self._data_bitrate)
         else:
             duration = classic_bits(identifier, data) / self._bitrate
         self.busy_seconds += duration
-        # a controller has a queue: the next frame is made ready while this one is still on the wire
+        # As in a controller's queue, the next frame is prepared while this one is still on the wire.
         queued = now - self._free_at < self._last
         begin = self._free_at if queued else now
         self._free_at = begin + duration if self._wire is None else self._wire.occupy(begin, duration)
@@ -112,14 +112,14 @@ class Wire:
     A small file by the bus's name, gone with its last user.
     """
 
-    _turn: Final = threading.Lock()  # locks of POSIX are a process's, not a thread's
+    _turn: Final = threading.Lock()  # POSIX locks exclude processes, not threads
 
     def __init__(self, bus: str) -> None:
         name = f"teds-pace-{os.getuid()}-{hashlib.sha256(bus.encode()).hexdigest()[:16]}"
         self._path = Path(tempfile.gettempdir()) / name
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._file, fcntl.LOCK_SH)  # says that it is used; turns are taken by another kind of lock
-        os.ftruncate(self._file, _UNTIL.size)  # as it is, or zero
+        fcntl.flock(self._file, fcntl.LOCK_SH)  # marks the file as in use; turns need another kind of lock
+        os.ftruncate(self._file, _UNTIL.size)  # keeps its contents; a new file is filled with zeros
         self._shared = mmap.mmap(self._file, _UNTIL.size)
 
     def occupy(self, begin: float, duration: float) -> float:
@@ -128,7 +128,7 @@ class Wire:
             fcntl.lockf(self._file, fcntl.LOCK_EX)
             try:
                 taken, busy = _UNTIL.unpack(self._shared[:])
-                if taken - begin < _LONGEST_QUEUE:  # else of a clock that started again
+                if taken - begin < _LONGEST_QUEUE:  # otherwise the time is from before a restart of the clock
                     begin = max(begin, taken)
                 self._shared[:] = _UNTIL.pack(begin + duration, busy + duration)
             finally:
@@ -178,7 +178,7 @@ def _classic_head(identifier: int, octets: int) -> tuple[int, int, int, int]:
 @lru_cache(1024)
 def _fd_head(identifier: int) -> tuple[int, int, int]:
     """Return the bits at the nominal rate before the data, their stuff bits, and the run that they end with."""
-    # start, base identifier, SRR, IDE, extension, RRS, FDF, reserved, BRS
+    # Start, base identifier, SRR, IDE, extension, RRS, FDF, reserved, BRS.
     nominal = [0, *_bits(identifier >> 18, 11), 1, 1, *_bits(identifier & 0x3FFFF, 18), 0, 1, 0, 1]
     return len(nominal), *_runs(nominal)
 
@@ -217,7 +217,7 @@ def _run(state: int, value: int, width: int) -> tuple[int, int]:
     for bit in _bits(value, width):
         run = run + 1 if bit == last else 1
         last = bit
-        if run == 5:  # one bit after five equal ones, itself the first of the next run
+        if run == 5:  # a stuff bit after five equal ones; it is the first of the next run
             stuffed, last, run = stuffed + 1, 1 - bit, 1
     return stuffed, 1 + 4 * last + run - 1
 

@@ -231,7 +231,7 @@ class CanPort(MeasuringLink):
         reported: set[bytes] = set()
         notice(Notice("waiting", f"Looking for the node on {self.spec.text}.", seconds))
         if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
-            # ask at the node's last address: there is no random wait, unlike after a broadcast
+            # Ask at the node's last address first: unlike a broadcast, this has no random delay.
             identity = self.identify(address, seconds=_GUESS_SECONDS)
             guessed = self.contact(address, identity) if identity is not None and wanted(identity) else None
             if guessed is not None:

@@ -94,7 +94,7 @@ def parse_spec(text: str) -> CanSpec:
     bitrate = _number(values, "bitrate", 1, 1_000_000)
     data_bitrate = _number(values, "data_bitrate", 1, 20_000_000)
     if interface == "udp_multicast":
-        options.setdefault("hop_limit", 0)  # python-can's own default of 1 puts every frame on the network
+        options.setdefault("hop_limit", 0)  # with python-can's default of 1, every frame would reach the local network
     return CanSpec(
         interface,
         channel,

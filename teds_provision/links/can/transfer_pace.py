@@ -65,7 +65,7 @@ class TransferPace:
             passed = now - self._began
             if passed >= _WINDOW:
                 self._load, self._streams, self._began = self._streams / passed, 0.0, now
-            elif passed > 0:  # of a stream that has just begun a window is not over yet
+            elif passed > 0:  # the first window of a stream is not over yet
                 return max(self._load, self._streams / _WINDOW)
             return self._load
 
@@ -80,7 +80,7 @@ class TransferPace:
             used, self._counted = self._others - self._counted, self._others
             left = 0.0
             if load > 0:
-                # what was used since the last call began then; time that was left over before it is not saved up
+                # The octets since the last call were sent from then on; unused time before it is not saved up.
                 self._free_at = max(self._free_at, self._left) + used / max(_LEAST, _MOST - load)
                 left = max(0.0, self._free_at - now)
             self._left = now + left

@@ -64,7 +64,7 @@ def decode(octets: bytes) -> tuple[NdefRecord, ...]:
         if bool(flags & 0x80) != (not records and chunk is None):
             raise GarbledError("The NDEF message has no valid beginning.")
         ended = bool(flags & 0x40)
-        # a record continues with a chunk if one is open, and only then
+        # A record continues a chunk if one is open, and only then.
         if (chunk is not None) != (record.tnf == 6) or (chunk is not None and record.type):
             raise GarbledError("The NDEF message has a chunk out of order.")
         if chunk is not None:

@@ -24,13 +24,13 @@ from typing import Any
 from teds_provision.links.ports import Trace
 
 _MOST_INDEX = 16  # of InCommunicateThru's time-out, 0.1 ms · 2^(n - 1)
-_LATE = 0.1  # seconds beyond the chip's own time-out that nfcpy gives the host command
-_TIMED_OUT = 0x01  # status of the chip: the target has not answered
+_LATE = 0.1  # seconds beyond the chip's own time-out before nfcpy's host command times out
+_TIMED_OUT = 0x01  # status of the chip: no answer from the target
 
 
 def _load() -> Any:
     shown, find = warnings.showwarning, ctypes.util.find_library
-    ctypes.util.find_library = lambda name: None  # LLCP is not used here
+    ctypes.util.find_library = lambda name: None  # LLCP is not used, so its library need not be searched
     try:
         import nfc
         import nfc.clf.udp
@@ -99,7 +99,7 @@ class Frontend(nfc.ContactlessFrontend):  # type: ignore[misc]
     def open(self, path: str) -> bool:
         """Open the device at ``path``, a PN53x with its exchanges slimmed."""
         opened = bool(super().open(path))
-        pn53x = getattr(nfc.clf, "pn53x", None)  # imported by nfcpy when its first driver is
+        pn53x = getattr(nfc.clf, "pn53x", None)  # nfcpy imports it with its first driver
         if opened and pn53x is not None and isinstance(self.device, pn53x.Device):
             self.device.send_cmd_recv_rsp = _LeanExchange(self.device, pn53x).exchange
         return opened
@@ -111,7 +111,8 @@ class _LeanExchange:
     def __init__(self, device: Any, pn53x: Any) -> None:
         self._device, self._pn53x = device, pn53x
         self._whole = device.send_cmd_recv_rsp
-        self._target: Any = None  # for which registers and time-out are set; held, so that none takes its identity
+        # the target of the present settings; the reference prevents another object with the same id
+        self._target: Any = None
         self._rates = ("", "")
         self._index = 0
 

@@ -162,7 +162,7 @@ class _PcscType4(QuietExchange, Type4ATag):  # type: ignore[misc]
         self._extended_length_support = False
 
     def _is_present(self) -> bool:
-        self._dep.exchange(None)  # raises FieldLostError if it is not
+        self._dep.exchange(None)  # raises FieldLostError if the tag has left
         return True
 
 

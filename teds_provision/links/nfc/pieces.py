@@ -63,7 +63,7 @@ def room(max_ndef: int, others: int = 0) -> int:
     ``others`` counts the whole records in the same message. At least 1 when the profile can work; 0 or less when
     it cannot.
     """
-    left = max_ndef - others - 3 - len(TIM_TYPE)  # a short record: flags, type length, payload length
+    left = max_ndef - others - 3 - len(TIM_TYPE)  # for a short record: flags, type length, payload length
     if left > 255:
         left = max(255, left - 3)  # a payload length of 4 octets
     return left - _PIECE_HEAD

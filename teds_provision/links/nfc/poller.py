@@ -14,9 +14,9 @@ from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 
-PATIENCE = 5.0  # seconds that a station goes on reading
-LONGEST_INTERVAL = 0.032  # seconds between two reads past N_wait, doubling up to this
-LONGEST = 120.0  # seconds that one transaction may take, however the node spins it out
+PATIENCE = 5.0  # seconds for which a station keeps reading
+LONGEST_INTERVAL = 0.032  # seconds between two reads after N_wait, doubling up to this
+LONGEST = 120.0  # most seconds for one transaction, even if the node keeps asking for time
 _REREADS = 3  # of a torn message
 STATUS_OCTETS = len(message.encode([tnep.status(0)]))
 

@@ -23,7 +23,7 @@ from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, Reader
 from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
-# A tag on the reader: a node with the profile's service, or something else that deserves a notice.
+# A tag on the reader: a node with the profile's service, or another tag that deserves a notice.
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ def _listed(records: Sequence[NdefRecord]) -> str:
 
 REPEATS = 2  # of one transaction
 REPEAT_WITHIN = 15.0  # seconds
-RETURN_WITHIN = 3.0  # seconds that a node which slipped off has to come back in the middle of a transaction
+RETURN_WITHIN = 3.0  # seconds within which a node that lost contact may return during a transaction
 _PAUSE, _SHORT_PAUSE = 0.1, 0.03  # seconds between two polls of the field; the short one while boards are changed
 _CHANGING = 2.0  # seconds after a node left in which the next one is expected
 _REOPEN = 1.0  # seconds between two tries to open a lost reader
-_DEBOUNCE = 0.7  # seconds: the same node back within them was never away
-_LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read again
+_DEBOUNCE = 0.7  # seconds: a node that returns within them does not count as gone
+_LOOK_AGAIN = 1.0  # seconds until an unwanted tag is read again
 
 
 def open_port(where: str, trace: Trace | None = None) -> NfcPort:
@@ -106,7 +106,7 @@ class NfcPort:
         self.place = f"nfc:{self._again}"
         self._transaction = secrets.randbelow(0x10000)
         self._lost = False
-        self._failures = 0  # of the reader, since it last polled the field
+        self._failures = 0  # failures of the reader since it last polled the field
         self.turn = threading.RLock()
 
     @property
@@ -165,7 +165,7 @@ class NfcPort:
         A reader that is unplugged is opened again when it is back. A node counts as gone when it did not answer for
         0.7 s.
         """
-        here: bytes | None = None  # the node of the visit that is not over yet
+        here: bytes | None = None  # the node whose visit has not ended
         link: NfcLink | None = None
         gone_at, reported = -_CHANGING, ""
         waiting = Notice("waiting", f"Place a node on the reader{self._named}.")
@@ -178,7 +178,7 @@ class NfcPort:
                 notice(waiting)
                 here = None
             if seen is None:
-                # Short where nodes are being changed, so that none is waited for.
+                # A short pause while boards are being changed, so that the next one is seen at once.
                 stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
                 continue
             if isinstance(seen, ForeignTag):
@@ -192,7 +192,7 @@ class NfcPort:
                 yield _contact(seen, link, self.trace)
                 link.close()
                 seen = link.seen
-            if link is not None and link.lost:  # the next tag is a new visit, the same node too
+            if link is not None and link.lost:  # the next tag starts a new visit, even if it is the same node
                 notice(_left(seen.identity.uuid))
                 notice(waiting)
                 here, link = None, None
@@ -262,7 +262,7 @@ class NfcPort:
             self.lose_reader()
             self._failures += 1
             if self._failures == 1 and not self._lost:
-                return None  # a single error: the next look opens it again, without a notice
+                return None  # after a single error, the next look reopens the reader without a notice
             if not self._lost:
                 self._lost = True
                 notice(Notice("reader-lost", f"{error.message} Waiting for it."))
@@ -340,11 +340,11 @@ class NfcLink:
         attempt = 0
         while True:
             try:
-                poller = self._ready_poller()  # a node that has left ends it here
+                poller = self._ready_poller()  # raises if the node has left
                 try:
                     return poller.transact(transaction, frame)
                 except (NodeSilentError, GarbledError) as error:
-                    # choose how to go on: in the same activation while the tag still answers, else from a new one
+                    # Go on in the same activation if the tag still answers, else in a new one.
                     if self._poller is not None and not isinstance(error, FieldLostError) and self.seen.tag.is_present:
                         self._poller.restart()
                     else:
@@ -357,7 +357,7 @@ class NfcLink:
                 self._port.lose_reader()
                 if reopened or attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
                     raise
-                reopened = True  # one error alone is not worth a word
+                reopened = True  # a single error gets no notice
                 self._port.reopen()
             except NoReaderError:
                 self._poller = None

@@ -18,7 +18,7 @@ from teds_provision.links.ports import Trace
 
 AUTO = "auto"
 _PATH = re.compile(r"usb(:[0-9a-fA-F]{4}(:[0-9a-fA-F]{4})?|:\d{1,3}(:\d{1,3})?)?|(tty|com):[^:]+(:\w+)?")
-_HOPELESS = 10  # polls in a row that the reader answers with an error
+_HOPELESS = 10  # polls in a row that fail with an error of the reader
 _NO_LIBUSB = "usb: paths need the C library libusb, which is not installed."
 
 
@@ -110,7 +110,7 @@ def plugged_in() -> list[str]:
     """Return the paths of the readers that ``auto`` chooses from: USB readers, else those of PC/SC. None is opened."""
     try:
         found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
-    except NoReaderError:  # no libusb: a PC/SC reader needs none
+    except NoReaderError:  # without libusb, PC/SC readers still work
         found = []
     return found or paths()
 

@@ -23,10 +23,10 @@ from teds_provision.links.nfc.nfcpy import (
     nfc,
 )
 
-_TRIES = 3  # of a read, before the message counts as unreadable
-_PRESENCE_WAIT = 0.06  # seconds for a Type 4 tag to show that it is still there
+_TRIES = 3  # reads before the message counts as unreadable
+_PRESENCE_WAIT = 0.06  # seconds for a Type 4 tag to answer a presence check
 _ANSWER = 78  # octets of an NDEF message with the shortest sealed answer (profile: wire, "NFC")
-_APDU_SECONDS = 5.0  # for one command of the tag and its answer: as long as a reply is waited for
+_APDU_SECONDS = 5.0  # for one command of the tag and its answer: as long as for a reply
 _FSC = (16, 24, 32, 40, 48, 64, 96, 128, 256)  # octets by FSCI (ISO/IEC 14443-4, table 1)
 
 
@@ -82,7 +82,7 @@ class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
         try:
             return self._read_from_start(ahead)
         except Type4TagCommandError as error:
-            self._takes_more = error.errno <= 0  # a tag that cannot be read beyond its message
+            self._takes_more = error.errno <= 0  # some tags refuse a read beyond their message
             return self._read_ndef_data()
 
     def _read_from_start(self, ahead: int) -> bytearray | None:

@@ -16,7 +16,7 @@ from teds_provision.arrays import NDArray
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.recordings.source import ROWS, Entry
 
-_EXACT = 2**53  # integers up to here are floats without loss
+_EXACT = 2**53  # integers up to here are exact as floats
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Rows:
     channels: tuple[int, ...]
     time: NDArray[Any]  # float64, unix seconds
     index: NDArray[Any]  # int64
-    tick: NDArray[Any]  # uint64; 0 if none is known
-    clock_error: NDArray[Any]  # float64, NaN if none is known
+    tick: NDArray[Any]  # uint64; 0 if unknown
+    clock_error: NDArray[Any]  # float64, NaN if unknown
     test: NDArray[Any]  # bool
     value: Sequence[NDArray[Any]]
     raw: Sequence[NDArray[Any]]
-    there: NDArray[Any]  # n × c bool: whether there is a raw value
+    there: NDArray[Any]  # n × c bool: True if there is a raw value
 
 
 class Streams:

@@ -36,7 +36,7 @@ from teds_provision.measure.sinks.wide import WideSink
 from teds_provision.portable import CLOSING, NOFOLLOW, OPENS_FOLDERS, is_mine, lock
 
 PARQUET: Final = ".parquet"
-_PATIENCE: Final = 5.0  # seconds beside two periods: then a stream that brings nothing is not waited for
+_PATIENCE: Final = 5.0  # seconds beyond two periods, after which a silent stream is not waited for
 _BURST: Final = 5000  # rows of a grid at a time
 
 
@@ -200,7 +200,7 @@ def _folder_for(target: Path) -> Iterator[Path]:
 
 def _sweep(target: Path) -> None:
     """Remove what a killed conversion to this name left: a folder of such a name, ours, without a lock."""
-    if not OPENS_FOLDERS:  # nothing shows whether a conversion still uses it
+    if not OPENS_FOLDERS:  # without locks on folders, a running conversion cannot be recognized
         return
     name = re.compile(re.escape(f".{target.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
     with suppress(OSError):

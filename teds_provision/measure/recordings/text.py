@@ -96,7 +96,7 @@ class TextRecording(Recording):
                 self.know(facts)
                 self._known.append(facts)
         self.station = station_of(words)
-        return []  # it ends in its head: a recorder that was killed early
+        return []  # the file ends within its head, as after an early kill
 
     def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""

@@ -15,9 +15,9 @@ from teds_provision.measure.clock import ClockMap
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
 
 WAITING = 2.0  # seconds that the first node waits for the others
-NOTICE_AFTER = 1.0  # seconds until the notice that a trigger waits
+NOTICE_AFTER = 1.0  # seconds until the notice that the trigger waits
 TOGETHER = 15.0  # seconds that a trigger waits for all nodes, from the first one that is ready
-AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time to it, and more for each node
+AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time until that time, and more for each node
 
 
 class CommonStart:
@@ -28,7 +28,7 @@ class CommonStart:
         self._alone = len(self._coming) < 2
         self._trigger, self._waiting = trigger, waiting
         self._triggered = self._told = False
-        self._at: float | None = None  # monotonic seconds of the start time, once it was chosen
+        self._at: float | None = None  # the start time in monotonic seconds, once it was chosen
         self._first: float | None = None
         self._turn = threading.Condition()
         self._begun: dict[bytes, tuple[ClockMap, int]] = {}

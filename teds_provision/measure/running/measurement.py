@@ -40,8 +40,8 @@ from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group
 REPORTING = 1.0
-WAITING = 3.0  # seconds without a master or a broker before a notice; rospy needs 2 to start
-ENDING = 10.0  # seconds for all nodes to let go
+WAITING = 3.0  # seconds without a ROS master or a broker before a notice; rospy needs 2 to start
+ENDING = 10.0  # seconds for all nodes to be released
 
 
 @dataclass
@@ -53,7 +53,7 @@ class Watcher:
     report: Callable[[NodeReport], None] = lambda _report: None
     sink: Callable[[Sink], None] = lambda _sink: None
     note: Callable[[str], None] = lambda _text: None
-    reread_done: Callable[[bytes], None] = lambda _uuid: None  # a node's datasheet was read whole while it is measured
+    reread_done: Callable[[bytes], None] = lambda _uuid: None  # the datasheet of a measured node was read completely
 
 
 @dataclass(frozen=True)
@@ -91,15 +91,16 @@ class Measurement:
         Raises what a sink's ``open`` raises; everything else is in the result.
         """
         self._host, self._lock = HostClock(), threading.Lock()
-        self._setting = threading.Lock()  # of the clock: until it is free, no block goes on; taken after _lock
+        # held while the clock is set: no block is passed on meanwhile; taken after _lock
+        self._setting = threading.Lock()
         self._known: dict[str, dict[int, ChannelFacts]] = {}  # by node and channel
-        self._chosen: dict[str, dict[int, str]] = {}  # names of topics, likewise
+        self._chosen: dict[str, dict[int, str]] = {}  # chosen names of topics, by node and channel
         for (uuid, number), name in self.facts.names.items():
             self._chosen.setdefault(uuid, {})[number] = name
-        self._grids: dict[str, Grid] = {}  # "": of all nodes together; else by UUID, each node's own
+        self._grids: dict[str, Grid] = {}  # "": all nodes together; otherwise one grid per UUID
         self._for_grid: deque[Block] = deque()
-        self._shown: dict[int, str] = {}  # by id, for two may have one name: the last notice about each sink,
-        self._waits: dict[int, float] = {}  # and since when one waits
+        self._shown: dict[int, str] = {}  # last notice about each sink, by id(), since two sinks may have the same name
+        self._waits: dict[int, float] = {}  # when each waiting sink began to wait, by id()
         self._common_start = CommonStart(self.uuids, trigger=self.request.trigger)
         self._ending = False
         opened: list[Sink] = []
@@ -110,7 +111,7 @@ class Measurement:
         except BaseException:
             for sink in opened:
                 sink.close()
-                if sink.recorder:  # nothing was measured: the next try gets the name that was asked for
+                if sink.recorder:  # nothing was recorded: remove the file, so that the next try can use the name
                     for name in sink.files:
                         Path(name).unlink(missing_ok=True)
             raise
@@ -173,7 +174,7 @@ class Measurement:
         if duration is None or left is None or not any(supervisor.ever_ran for supervisor in self.supervisors):
             return math.inf
         self.began()
-        # A stream that may begin when its node likes begins a moment after Subscribe.
+        # A stream that starts on its own has its first sample a moment after Subscribe.
         first = [supervisor.streams.first_sample() for supervisor in self.supervisors]
         return max(now + left, *first) + duration
 
@@ -201,7 +202,8 @@ class Measurement:
         if state != "waiting":
             del self._waits[id(sink)]
         before = self._shown.get(id(sink), "running")
-        news = f"{state} {stats.detail}".strip() if recorder else state  # it may have waited and gone on between looks
+        # the detail matters: a recorder may have waited and continued between two checks
+        news = f"{state} {stats.detail}".strip() if recorder else state
         if news == before or state not in ("failed", "running", "waiting"):
             return False
         if state == "waiting" and not recorder and now - since < WAITING:
@@ -315,12 +317,13 @@ class Measurement:
     def _block(self, block: Block) -> None:
         with self._setting:
             setting, _ = self._host.present
-            if block.clock is not None and block.clock != setting:  # dated just before the clock was set
+            # its time was computed just before the clock was set
+            if block.clock is not None and block.clock != setting:
                 block = replace(block, time=block.time + self._host.since(block.clock), clock=setting)
             for sink in self.sinks:
                 sink.write(block)
             if self._grids:
-                self._for_grid.append(block)  # without _lock: the thread that hears must not wait while rows are made
+                self._for_grid.append(block)  # without _lock: the listening thread must not wait while rows are made
         self.watcher.block(block)
 
     def _with_names(self, facts: Sequence[ChannelFacts]) -> Sequence[ChannelFacts]:

@@ -37,7 +37,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.teds.fits import parse_require
 
-AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole is begun again
+AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole is started again
 
 
 def whole_path(spec: str) -> str:
@@ -100,7 +100,7 @@ class MeasurementJob:
         """
         uuids = self.station.measurements.nodes_of(self.kept)
         name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])
-        # before this process marks them, too: whoever else measures a node has a share of what the node can send
+        # Read before this process marks the nodes itself: other measurements of a node share the rate that it can send.
         beside = {uuid: holder for uuid in uuids if (holder := self.station.measurements.holder(uuid)) is not None}
         with ExitStack() as stack:
             stack.enter_context(self.station.measurements.running(uuids, group=self.kept.group, what=f"measure {name}"))

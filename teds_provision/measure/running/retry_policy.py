@@ -52,7 +52,8 @@ class RetryPolicy:
         under the node's key. Without it any device on the bus can take the node's UUID and refuse: then the node is
         searched ``elsewhere``.
         """
-        if self.seconds_left == math.inf:  # a datasheet that was changed under its values ends what has an end
+        # no deadline: only a decision, or a datasheet that changed during the run, can end the tries
+        if self.seconds_left == math.inf:
             return self._ends and (decided or (proven and isinstance(error, BadDatasheetError)))
         if decided:
             return True

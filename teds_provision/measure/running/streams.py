@@ -23,7 +23,7 @@ from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.provisioning.conversation import SessionLostError
 
 UNSIGNED = "the datasheet is unsigned: raw values only"
-SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost
+SILENT = 2.0  # seconds without a good message, in addition to three messages' time, after which the node counts as lost
 
 
 @dataclass
@@ -89,9 +89,9 @@ class NodeStreams:
         self.running: dict[int, ReceivedStream] = {}
         self.totals: dict[int, StreamTotals] = {}
         self._host, self._on_block = host, deliver
-        self._held: list[Block] | None = None  # what comes before its channels were described
+        self._held: list[Block] | None = None  # blocks that arrived before their channels were described
         self._gate = threading.Lock()
-        self._run = 0  # the session's last
+        self._run = 0  # number of the last run in the session
         self._monotone: dict[int, MonotonicStamps] = {}
 
     def new_session(self) -> None:
@@ -200,7 +200,7 @@ class NodeStreams:
         """Return the totals of each stream until now."""
         return [past.with_run(self.running.get(number)) for number, past in self.totals.items()]
 
-    # -- whether the node is still there -----------------------------------------------------------------------------
+    # -- checking that the node still sends --------------------------------------------------------------------------
 
     def _steady(self) -> list[ReceivedStream]:
         """Return streams that have messages all the time: events, and streams waiting for a trigger, may be silent."""

@@ -19,8 +19,9 @@ from teds_provision.protocol.operation.timing import START_AFTER_MARK, TriggerTo
 from teds_provision.provisioning.conversation import SessionLostError
 
 TRIGGER_LIFE = 30  # seconds
-HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others win arbitration; a node in a busy process
-# sees it late. The bounds alone are below a millisecond, and would turn away nodes that tell the truth as they know it.
+HELD_BACK = 10_000_000  # ns of tolerance for late frames, see below
+# A controller may hold a frame back while others win arbitration, and a busy process sees it late. The clock bounds
+# alone are below a millisecond and would reject honest nodes.
 
 
 def pull(common_start: CommonStart, supervisors: Sequence[NodeSupervisor], note: Callable[[str], None]) -> None:

@@ -30,15 +30,15 @@ from teds_provision.measure.blocks import (
 Item = Block | GroupRows | NodeReport | ClockSet | tuple[ChannelFacts, ...]
 CommandTaker = Callable[[SetPointCommand], None]
 
-RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
-LIVE_WAITING = 256  # items that a live sink may owe: newest wins
-BUDGET: Final = 5000  # messages a second that one process carried to ROS 1, ROS 2 or MQTT (docs/ros.md)
-ROWS: Final = 1000  # rows a second of an array on a topic, at most; a recorder takes all of them
-TICK = 0.05  # seconds between looks at the clock while nothing comes
-LIVE_REST = 0.003  # seconds for which items gather before a live sink takes the next: a waking costs more than an item
-RECORDER_LOOKS = 0.02  # seconds between looks of a recorder at what waits
-TOGETHER = 64  # items that a recorder takes at a time, at most
-CLOSING = 30.0  # seconds for a recorder to write what it owes
+RECORDER_WAITING = 2_000_000  # values that may be queued for a recorder: some 200 MB, 40 s at 50,000 values a second
+LIVE_WAITING = 256  # items that may be queued for a live sink; the oldest are dropped
+BUDGET: Final = 5000  # messages a second that one process delivered to ROS 1, ROS 2 or MQTT (docs/ros.md)
+ROWS: Final = 1000  # most rows a second of an array on a topic; a recorder gets all of them
+TICK = 0.05  # seconds between calls of _idle while no item arrives
+LIVE_REST = 0.003  # seconds for which items gather before a live sink is woken, which costs more than an item
+RECORDER_LOOKS = 0.02  # seconds between a recorder's checks of its queue
+TOGETHER = 64  # most items that a recorder takes at a time
+CLOSING = 30.0  # seconds for a recorder to write its queue
 
 
 class Sink(Protocol):
@@ -103,7 +103,7 @@ class ThreadedSink(ABC):
 
     recorder = False
     budgeted = False
-    wants_rows = False  # whether rows of a group's grid are of use to it
+    wants_rows = False  # True if the sink uses rows of a group's grid
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -217,7 +217,8 @@ class ThreadedSink(ABC):
                 return
             if self.recorder:
                 if self._owed + values > RECORDER_WAITING:
-                    # Waiting would stop the measurement, dropping would leave an unnoticed hole: so it ends.
+                    # Waiting would stop the measurement, and dropping values would leave an unnoticed gap: end the
+                    # recording instead.
                     self._tally.fail(
                         f"The disk is too slow: {self.name} owes {self._owed} values. The recording has ended.",
                         "Record to a faster disk, or fewer channels.",
@@ -228,7 +229,7 @@ class ThreadedSink(ABC):
                 self._drop_oldest()
             self._items.append((time.monotonic(), values, item))
             self._owed += values
-            if not self.recorder:  # it looks by itself: to be woken for each block costs more than to write it
+            if not self.recorder:  # recorders poll: waking one for each block costs more than writing it
                 self._lock.notify_all()
 
     def _drop_oldest(self) -> None:
@@ -263,7 +264,7 @@ class ThreadedSink(ABC):
     def _work(self) -> None:
         try:
             self._guarded_begin()
-            if self.stats.state == "starting":  # a sink that waits for consumers has reported it by now
+            if self.stats.state == "starting":  # a sink that waits for consumers has set its state by now
                 self._set_state("running")
             self._run()
         except TedsProvisionError as error:

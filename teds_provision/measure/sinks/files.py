@@ -23,14 +23,14 @@ from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failur
 from teds_provision.measure.sinks.json_events import iso
 from teds_provision.portable import CLOSING, lock
 
-FLUSH = 0.1  # seconds that a piece may wait in this process
-SYNC = 1.0  # seconds that it may wait in the system's cache
-PIECE = 1 << 18  # octets that are handed to the system at once, at most
+FLUSH = 0.1  # seconds for which octets may remain in this process
+SYNC = 1.0  # seconds for which they may remain in the system's cache
+PIECE = 1 << 18  # most octets that are written at once
 PARTS = 100_000
 LARGEST_PART = 1 << 30  # octets; then the next part begins
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-ROOM = 1 << 20  # octets that are free before a part is begun on a disk that was full
-AGAIN = 1.0  # seconds between looks whether there is room
+ROOM = 1 << 20  # octets that must be free before a part is begun on a disk that was full
+AGAIN = 1.0  # seconds between checks for free space
 
 
 class Part:
@@ -48,7 +48,7 @@ class Part:
             path.unlink(missing_ok=True)
             raise
         self.size = 0
-        self.lost = 0  # values of pieces that are not in the file, after an error
+        self.lost = 0  # values that are not in the file after an error
         self._waiting: list[tuple[bytes, int]] = []
         self.waiting_octets = 0
         self._synced = self._flushed = time.monotonic()
@@ -118,10 +118,11 @@ class FileSink(ThreadedSink):
         self._part: Part | None = None
         self.station = StationFacts("")
         self.facts: dict[tuple[str, int], ChannelFacts] = {}
-        self._full: tuple[float, int, str] | None = None  # since when (unix), dropped until then, what is the matter
+        # while the disk is full: since when (unix), values dropped, the reason
+        self._full: tuple[float, int, str] | None = None
         self._tried = 0.0
         self._gaps: list[str] = []
-        self._clock_sets_due: list[ClockSet] = []  # came while no part could be written
+        self._clock_sets_due: list[ClockSet] = []  # arrived while no part could be written
         self.reports: dict[str, NodeReport] = {}
         """The newest of each node."""
 
@@ -189,7 +190,7 @@ class FileSink(ThreadedSink):
                 part.abandon()
         return self._parts
 
-    # -- what a full disk and the system's clock do ------------------------------------------------------------------
+    # -- full disk, and changes of the system's clock ----------------------------------------------------------------
 
     def _note(self, at: float, text: str) -> None:
         """Write words about the recording into the part, as its format has them."""
@@ -212,7 +213,7 @@ class FileSink(ThreadedSink):
             return
         try:
             if isinstance(item, ClockSet):
-                # The clock was set: another part, which begins when this recording did by the new clock
+                # The clock was set: begin another part, with this recording's start corrected to the new clock.
                 self._note(item.time - item.by, item.words)
                 self.station = replace(self.station, started=self.station.started + item.by)
                 self._new_part()

@@ -62,7 +62,8 @@ class FoxgloveSink(ThreadedSink):
         if self._own:
             self.server.start(station.name)
         self._published = self.server.begin()
-        self._channel(self._reports, "std_msgs/msg/String", STRING, {})  # before the first one, else it is missed
+        # created before the first report, which clients would miss otherwise
+        self._channel(self._reports, "std_msgs/msg/String", STRING, {})
         self._describe(facts)
 
     @property

@@ -45,7 +45,7 @@ class FoxgloveServer:
             import foxglove
         except ImportError as error:
             raise UsageError("Foxglove needs the package foxglove-sdk.", hint=how_to_install("foxglove")) from error
-        foxglove.set_log_level("ERROR")  # its server writes a line for each client that leaves
+        foxglove.set_log_level("ERROR")  # otherwise its server logs a line for each client that leaves
         self._exposure.require_pair()
         certificate, key = self._exposure.certificate, self._exposure.key
         self._sdk, self._context = foxglove, foxglove.Context()
@@ -137,7 +137,7 @@ class MeasurementTopics:
         self._server = server
         self.channels: dict[str, foxglove.Channel] = {}
         self.latest: dict[str, bytes] = {}
-        self.parameters: dict[str, str] = {}  # replaced as a whole: threads of the SDK read it
+        self.parameters: dict[str, str] = {}  # always replaced as a whole, because threads of the SDK read it
 
     def channel(self, topic: str, kind: str, definition: str, metadata: dict[str, str]) -> foxglove.Channel:
         """Return the channel of a topic, shared with other measurements that use it."""

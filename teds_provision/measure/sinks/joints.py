@@ -77,7 +77,7 @@ def _of_node(uuid: str, channels: Sequence[ChannelFacts], topics: Topics) -> lis
         name = topics.node(uuid)
         if len(actuators) > 1:
             name = f"{name}_{topics.channel(*facts.key).rpartition('/')[2]}"
-        # Sensors belong to actuators one by one, in their order; with more or fewer the match is unknown.
+        # Sensors are matched to actuators in order; if their numbers differ, the match is unknown.
         state = {kind: own[place] for kind, own in sensors.items() if len(own) == len(actuators)}
         found.append(Joint(name, uuid, facts.number, command, state))
     return found

@@ -30,7 +30,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-_WITHIN = ("units", "siblings", "chosen")  # fields of facts that are of use in this process alone
+_WITHIN = ("units", "siblings", "chosen")  # fields of facts that are used only in this process
 
 
 def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:

@@ -92,17 +92,17 @@ class TopicSink(ThreadedSink):
         super().__init__(name)
         self._commands = commands
         self._station = StationFacts("")
-        # By node, as those below: a node that joins costs no look at the others.
+        # Nested by node, so that a joining node does not require a pass over all others.
         self._facts: dict[str, dict[int, ChannelFacts]] = {}
         self._topics = Topics(self._station)
         self._scalars: dict[str, dict[tuple[int, tuple[int, ...]], _Scalars]] = {}
         self._reports: dict[str, NodeReport] = {}
-        self._arrays: dict[tuple[tuple[str, int], ...], float] = {}  # time of the last row that went out
+        self._arrays: dict[tuple[tuple[str, int], ...], float] = {}  # time of the last published row
         self._labels: dict[str, dict[tuple[tuple[str, int], ...], list[str]]] = {}  # by GroupRows.group
-        self._joints: list[Joint] = []  # by name; a new list for each change, as other threads read it
+        self._joints: list[Joint] = []  # sorted by name; replaced at each change, because other threads read it
         self._joints_of: dict[str, list[Joint]] = {}
-        self._newest: dict[tuple[str, int], float] = {}  # of what joints need
-        self._described: dict[str, str] = {}  # topic on which a node's datasheet is
+        self._newest: dict[tuple[str, int], float] = {}  # the newest values, for joints
+        self._described: dict[str, str] = {}  # topic of each node's published datasheet
         self._sent = 0
         self._second = 0.0
         self.refused_commands = 0
@@ -197,7 +197,7 @@ class TopicSink(ThreadedSink):
     def _learn(self, item: NodeReport | ClockSet | tuple[ChannelFacts, ...]) -> list[ChannelFacts]:
         """Keep a report or facts; gives the facts that are new, and those of nodes that have another name now."""
         if isinstance(item, ClockSet):
-            self._arrays.clear()  # else no row would go out until a clock that was put back had caught up
+            self._arrays.clear()  # if the clock was set back, no row would be published until it had caught up
             return []
         if isinstance(item, NodeReport):
             self._reports[item.uuid] = item
@@ -207,7 +207,7 @@ class TopicSink(ThreadedSink):
         touched, own = self._topics.learn(changed), {facts.uuid for facts in changed}
         for uuid in touched:
             topic = self._described.get(uuid)
-            if topic is not None and topic != self._topics.of_node(uuid, "teds"):  # the old sheet must not be found
+            if topic is not None and topic != self._topics.of_node(uuid, "teds"):  # remove the old datasheet
                 del self._described[uuid]
                 self._retire(topic)
                 if uuid not in own:
@@ -272,7 +272,7 @@ class TopicSink(ThreadedSink):
 
     def _block(self, block: Block) -> None:
         rate = self._station.scalar_rate
-        # A test pattern is no measurement: it goes to recorders, which mark it, and to no topic, which cannot.
+        # A test pattern is not a measurement: recorders mark it, but topics cannot, so it is not published.
         if rate <= 0 or block.test_pattern or not len(block.time):
             return
         streams, key = self._scalars.setdefault(block.uuid, {}), (block.stream, block.channels)
@@ -282,7 +282,7 @@ class TopicSink(ThreadedSink):
         now = time.monotonic()
         if now < scalars.due:
             return
-        # The next beat, not "now + period": else each delay would slow the topic down permanently.
+        # The next beat, not "now + period": otherwise each delay would slow the topic down permanently.
         scalars.due = scalars.due + 1 / rate if now < scalars.due + 1 / rate else now + 1 / rate
         self._publish(block, scalars)
 

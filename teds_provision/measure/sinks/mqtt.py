@@ -51,11 +51,11 @@ FILES: Final = ("password-file", "ca", "cert", "key")
 """Keys of the URL; each names a file."""
 _MOST_OCTETS: Final = 1 << 20
 PORTS = {"mqtt": 1883, "mqtts": 8883}
-_JSON: Final = json.JSONEncoder(allow_nan=False)  # json.dumps would make one for each message
-_FULL: Final = 15  # what the library answers where WAITING messages wait
-_FAREWELL: Final = 2.0  # seconds for the broker to take that this measurement has ended
-KEEP_ALIVE = 15  # seconds: the broker reports offline after one and a half of it
-WAITING = 1000  # messages that the library may hold for a slow broker; what it does not take is offered again
+_JSON: Final = json.JSONEncoder(allow_nan=False)  # json.dumps would make an encoder for each message
+_FULL: Final = 15  # the library's return code if WAITING messages are queued
+_FAREWELL: Final = 2.0  # seconds to publish that this measurement has ended
+KEEP_ALIVE = 15  # seconds: the broker reports offline after one and a half times this
+WAITING = 1000  # messages that the library may queue for a slow broker; refused ones are offered again
 RUNS = "{{ 'online' if value_json.state == 'running' else 'offline' }}"  # a template of Home Assistant
 DEVICE_CLASSES = {"°C": "temperature", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "lx": "illuminance"}
 
@@ -95,8 +95,8 @@ class MqttSink(ThreadedSink):
         self._units: dict[tuple[str, int], WrittenUnit | None] = {}
         self._parts_of_topics: dict[str, str] = {}
         """The name of each node in topics, as it was announced last."""
-        self._owed_entities: dict[tuple[str, int], None] = {}  # to be announced, in this order
-        self._left: list[str] = []  # topics of names that nodes had, whose retained states go
+        self._owed_entities: dict[tuple[str, int], None] = {}  # entities to announce, in this order
+        self._left: list[str] = []  # topics of former names, whose retained states must be removed
         self._newest: dict[str, dict[str, float | None]] = {}
         self._due: dict[str, float] = {}
 
@@ -137,7 +137,7 @@ class MqttSink(ThreadedSink):
     def _tls(self) -> ssl.SSLContext:
         """Return how the broker is checked, and what this client presents; raises NotFoundError, BadDataError."""
         for named, path in self._files.items():
-            _octets(named, path)  # the library reads by name and knows no limit
+            _octets(named, path)  # checks the size: the library opens files by name, without a limit
         try:
             context = ssl.create_default_context(cafile=self._files.get("ca"))
         except (ssl.SSLError, OSError) as error:
@@ -245,7 +245,7 @@ class MqttSink(ThreadedSink):
 
     def _discover(self, facts: ChannelFacts) -> bool:
         """Announce a channel; False if it has to be done again."""
-        if facts.unsigned:  # raw values alone, which are none of anything: no sensor to show
+        if facts.unsigned:  # raw values have no quantity, so there is no sensor to show
             return True
         node = f"{self._topics.station}/{self._topics.node(facts.uuid)}"
         marked = " (unverified)" if facts.unverified else ""
@@ -329,7 +329,7 @@ class MqttSink(ThreadedSink):
         while message.rc == _FULL and time.monotonic() < until:
             time.sleep(TICK)
             message = self._client.publish(self._status, "offline", qos=1, retain=True)
-        with suppress(ValueError, RuntimeError):  # it was not taken
+        with suppress(ValueError, RuntimeError):  # the message was not accepted
             message.wait_for_publish(max(0.0, until - time.monotonic()))
             return bool(message.is_published())
         return False
@@ -364,7 +364,7 @@ def _files_of(query: str, *, tls: bool) -> dict[str, str]:
 def _octets(key: str, path: str) -> bytes:
     """Return a small regular file that the URL names by this key; raises NotFoundError, BadDataError."""
     try:
-        if not stat.S_ISREG(Path(path).stat().st_mode):  # a pipe would block the sink until it has a writer
+        if not stat.S_ISREG(Path(path).stat().st_mode):  # opening a pipe would block until it has a writer
             raise BadDataError(f"{key}={path} is no regular file.", hint="Check the URL of the broker.")
     except (OSError, ValueError) as error:
         raise NotFoundError(f"{key}={path} cannot be read.", hint="Check its path and mode.") from error
@@ -389,6 +389,6 @@ def _in_words(error: BaseException, host: str, port: int) -> str:
         return f"nothing is listening at {host}:{port}"
     if isinstance(error, TimeoutError):
         return f"{host}:{port} does not answer"
-    if isinstance(error, ConnectionResetError):  # while TLS begins
+    if isinstance(error, ConnectionResetError):  # during the TLS handshake
         return f"{host}:{port} closed the connection; it may not support TLS (mqtt://)"
     return f"{host}:{port} cannot be reached: {getattr(error, 'strerror', None) or error}"

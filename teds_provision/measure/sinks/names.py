@@ -22,7 +22,7 @@ LONGEST = 60
 TOKEN = re.compile(r"[A-Za-z](?:[A-Za-z0-9]|_(?=[A-Za-z0-9]))*\Z")
 
 
-@lru_cache(maxsize=4096)  # asked for each value that goes to a broker
+@lru_cache(maxsize=4096)  # called for each value that goes to a broker
 def slug(text: str) -> str:
     """Return an operator's or a datasheet's name as one part of a topic; empty if nothing is left of it."""
     letters = unicodedata.normalize("NFKD", text.casefold()).encode("ascii", "ignore").decode().lower()
@@ -61,11 +61,11 @@ class Topics:
                     hint="Use letters, digits and single _, beginning with a letter; / between parts.",
                 )
         self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
-        self._numbers: dict[str, set[int]] = {}  # of each node: what of it has a chosen name, 0 for its own part
+        self._numbers: dict[str, set[int]] = {}  # per node: channels with a chosen name; 0: the node itself has one
         for uuid, number in self._chosen:
             self._numbers.setdefault(uuid, set()).add(number)
-        self._channels: dict[str, dict[int, str]] = {}  # of each node: name of each channel as it calls itself
-        self._known = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
+        self._channels: dict[str, dict[int, str]] = {}  # per node: names of its channels, from the datasheet
+        self._known = {uuid: slug(name) for uuid, name in station.nodes.items()}  # the station's name of each node
         self._strangers: dict[str, str] = {}
         self._unverified: dict[str, str] = {}  # unsigned names: a separate namespace
         self._nodes: dict[str, str] = {}
@@ -87,7 +87,7 @@ class Topics:
                 if channel_facts.uuid not in self._known:
                     self._strangers[channel_facts.uuid] = slug(channel_facts.node)
             if channel_facts.chosen is not None and self._has_others(channel_facts.uuid, dict(channel_facts.chosen)):
-                # Names that were chosen while the node was not measured; they change no other node's
+                # Names chosen while the node was not measured; those of other nodes do not change.
                 self._chosen = {key: name for key, name in self._chosen.items() if key[0] != channel_facts.uuid}
                 self._chosen |= {(channel_facts.uuid, number): name.strip("/") for number, name in channel_facts.chosen}
                 self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}

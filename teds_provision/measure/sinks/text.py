@@ -26,7 +26,7 @@ from teds_provision.measure.sinks.json_events import facts_as_json, iso
 from teds_provision.sanitize import printable
 
 _UNITS: Final = {"si": "SI", "shown": "as shown to people; each channel states the way to SI"}
-FORMULA = ("=", "+", "-", "@")  # a cell that begins so would be computed by a spreadsheet
+FORMULA = ("=", "+", "-", "@")  # a spreadsheet would evaluate a cell that begins with one of these
 
 
 class TextSink(FileSink):
@@ -39,7 +39,7 @@ class TextSink(FileSink):
         super().__init__(path)
         self._comma = "," if path.suffix.lower() == ".csv" else "\t"
         self._columns: dict[tuple[str, int], int] = {}
-        self._headed = False  # whether this part has its head
+        self._headed = False  # True if this part has its head
         self._states: dict[str, str] = {}
         """State of each unmeasured node in this part: repeated tries get no line each."""
         self._templates: dict[tuple[str, tuple[int, ...], bool, str], tuple[str, list[int]]] = {}
@@ -190,7 +190,7 @@ def counted(report: NodeReport) -> str:
 
 def _raw_values(block: Block) -> list[list[Any]]:
     rows: list[list[Any]] = block.raw.tolist()
-    if block.raw.dtype.kind == "O":  # beyond 64 bits, or octet strings
+    if block.raw.dtype.kind == "O":  # integers of more than 64 bits, or octet strings
         return [[cell.hex() if isinstance(cell, bytes) else cell for cell in row] for row in rows]
     return rows
 

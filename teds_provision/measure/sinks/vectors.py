@@ -22,11 +22,11 @@ from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.units import units_of
 
-# Which ROS message fits a channel: by unit and meaning, else a plain number.
+# Which ROS message fits a channel: by unit and meaning, otherwise a plain number.
 #
-# REP 103: SI units and radians. A variance of 0 means "unknown" in sensor_msgs. Where a profile knows the standard
-# deviation, its square is the variance. The uncertainty of a datasheet (OError) is a worst case; (OError / √3)² is its
-# variance if every error inside is equally likely, which the metadata say.
+# REP 103: SI units and radians. A variance of 0 means "unknown" in sensor_msgs. If a profile has the standard
+# deviation, the variance is its square. The uncertainty of a datasheet (OError) is a worst case; if every error within
+# it is equally likely, the variance is (OError / √3)²; the metadata state this.
 
 KELVIN = 273.15  # 0 °C
 VARIANCE_NOTE = (
@@ -45,7 +45,7 @@ class Meaning:
     type: str  # ROS 1 spelling: sensor_msgs/Temperature
     field: str
     shift: float = 0.0
-    variance: bool = False  # whether the message has a field for it
+    variance: bool = False  # True if the message has a field for it
 
     def field_value(self, value: float) -> float:
         """Return the value of the message's field."""

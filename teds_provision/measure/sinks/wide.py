@@ -32,14 +32,14 @@ class WideSink(TextSink):
         super().__init__(path)
         self._form = ""
         self._changed = False
-        self._unwritten: list[tuple[float, str]] = []  # notes that wait for the head of their part
+        self._unwritten: list[tuple[float, str]] = []  # notes that wait until their part has a head
         self._nan = re.compile(f"(?<=[{self._comma}])nan(?=[{self._comma}\n])")
 
     def _process_item(self, item: Item) -> None:
         if isinstance(item, GroupRows):
             self._rows_of(item)
         elif isinstance(item, tuple):
-            if self._learn(item):  # other columns, or another datasheet: the next rows begin another part
+            if self._learn(item):  # the columns or the datasheet changed: the next rows begin another part
                 self._changed = bool(self._columns)
         elif not isinstance(item, Block):
             super()._process_item(item)
@@ -54,7 +54,8 @@ class WideSink(TextSink):
 
     def _head_of(self, known: list[ChannelFacts]) -> None:
         self._preamble(known, ["time", *heads_of(known)])
-        if len(self.files) > 1:  # rows lag behind: in the first part what was counted by now is of rows to come
+        # rows lag behind, so reports in the first part would count samples of rows that are still to come
+        if len(self.files) > 1:
             for report in self.reports.values():
                 self._state(report)
         notes, self._unwritten = self._unwritten, []

@@ -37,7 +37,7 @@ from teds_provision.station.station import Station
 
 HOLD: Final = 1.0  # seconds, if a request has none
 _STARTING: Final = 15.0
-_OPENING, _LOOK = 5.0, 0.05  # seconds for a session that is being opened, and between looks at it
+_OPENING, _LOOK = 5.0, 0.05  # seconds to wait for a session that is being opened, and between checks of it
 Measured = Callable[[str], AbstractContextManager[VerifiedSession | None]]
 
 
@@ -60,9 +60,9 @@ class _HeldActuator:
     error: TedsProvisionError | None = None
     safe: bool | None = None
     ended: bool = False
-    let_go: bool = False  # it is on its way to its safe state: no later order is for this one
+    let_go: bool = False  # the actuator is being released: new set points need a new lease
     crossed: bool = False
-    before: _HeldActuator | None = None  # the same actuator, which is being let go still
+    before: _HeldActuator | None = None  # the lease before on the same actuator, which is still being released
 
 
 @dataclass
@@ -155,12 +155,12 @@ class ActuatorLeases:
             held, fresh = self._held_for(uuid, channel, value, unit)
             with held.news:
                 if held.let_go and not fresh:
-                    continue  # since we looked
+                    continue  # released since _held_for returned it
                 held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)
                 held.order = _SetPointOrder(value, unit, held.order.number + (not fresh))
                 held.news.notify_all()
                 if fresh:
-                    who = contextvars.copy_context()  # on whose word, for the audit log
+                    who = contextvars.copy_context()  # keeps the actor for the audit log
                     work = (self._run, held, value, unit)
                     threading.Thread(target=who.run, args=work, name=f"hold {held.uuid[:8]}", daemon=True).start()
                 return held, held.order.number
@@ -206,7 +206,7 @@ class ActuatorLeases:
         for uuid, channel in every:
             self.release_actuator(uuid, channel)
 
-    # -- the thread of one actuator ----------------------------------------------------------------------------------
+    # -- the thread of one lease -------------------------------------------------------------------------------------
 
     def _run(self, held: _HeldActuator, value: float, unit: str | None) -> None:
         node, facts = bytes.fromhex(held.uuid), {"channel": held.channel}
@@ -221,13 +221,13 @@ class ActuatorLeases:
             held.error = error
         finally:
             outcome = "done" if held.error is None else held.error.code
-            with suppress(StoreError):  # a full disk must not keep who waits for this waiting
+            with suppress(StoreError):  # a full disk must not keep callers waiting
                 asked = {"value": held.order.value, "unit": held.order.unit or ""}
                 why = {} if held.error is None else {"why": held.error.message}
                 self._station.audit("set", node, outcome, safe=held.safe, **asked, **why, **facts)
             self._publish_state(held, safe=held.safe)
             with self._guard:
-                if self._held.get((held.uuid, held.channel)) is held:  # not the one after it
+                if self._held.get((held.uuid, held.channel)) is held:  # unless a later lease has taken its place
                     del self._held[held.uuid, held.channel]
             with held.news:
                 held.ended = held.let_go = True
@@ -257,7 +257,7 @@ class ActuatorLeases:
     @contextmanager
     def _own_session(self, uuid: str) -> Iterator[VerifiedSession]:
         writer = self._lent_for(uuid)
-        if writer is not None:  # a claim would spoil what it writes: a datasheet does not change under one
+        if writer is not None:  # its datasheet may change, and a claim is bound to the datasheet
             raise NodeBusyError(f"Node {uuid} is busy: {writer}.", hint="Try again when that is done.")
         contact = self._node_jobs.contact(uuid)
         if contact is None:
@@ -279,7 +279,7 @@ class ActuatorLeases:
                     order = held.order
                     if time.monotonic() >= held.until and answered >= order.number:
                         held.let_go = True
-                    if held.let_go:  # later requests claim it again
+                    if held.let_go:  # a later request claims the actuator again
                         return
                 standing.require()
                 with session(held.uuid) as trusted:
@@ -334,7 +334,8 @@ class ActuatorLeases:
             except NodeRefusedError as refusal:
                 if refusal.reason != Reason.WRONG_STATE:
                     raise
-                # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
+                # This session has already claimed the channel, for set points from a topic; only a measurement does
+                # this.
                 raise NodeBusyError(
                     f"Channel {held.channel} is controlled by set points from a topic.",
                     hint="Stop the publisher, then try again.",

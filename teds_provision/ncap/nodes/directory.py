@@ -52,16 +52,17 @@ class NodePresence:
     present: bool = False
     seen: float = 0.0
     tapped: float = 0.0
-    says: str | None = None  # its state by a plain Identify: a hint, for who is not known
-    heard: dict[str, Any] | None = None  # the verdict on what it last said in no session: shown beside, never instead
+    says: str | None = None  # state by a plain Identify, for an unknown node: a hint
+    # verdict on what it sent outside a session; shown in addition to the stored one, not instead of it
+    heard: dict[str, Any] | None = None
     looked: float = 0.0
     problem: Problem | None = None
     power: dict[str, Any] | None = None
-    firmware: dict[str, Any] | None = None  # what it reported in no session; what is stored goes before it
+    firmware: dict[str, Any] | None = None  # its firmware report outside a session; a stored report takes precedence
     measurement: str | None = None
     report: dict[str, Any] | None = None
     busy: str = ""
-    version: int = 0  # grows with each change here
+    version: int = 0  # incremented by each change of this object
 
 
 class NodeDirectory:
@@ -75,14 +76,15 @@ class NodeDirectory:
         self._lock, self._reading = threading.RLock(), threading.Lock()
         self._seen: dict[str, NodePresence] = {}
         self._rows: dict[str, KnownNode] = {}
-        self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
+        self._judged: dict[str, NodeVerdict | None] = {}  # by the store's rows and the present trust
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
-        self._shown_in: dict[str, Mapping[int, str]] = {}  # the display units with which the channels were decoded
-        self._own_names: dict[str, str] = {}  # from the datasheet of each
-        self._origins: dict[str, dict[str, Any] | None] = {}  # what each wraps
-        self.changes = 0  # grows with each change of a node's name or datasheet
+        self._shown_in: dict[str, Mapping[int, str]] = {}  # display units with which the channels were decoded
+        self._own_names: dict[str, str] = {}  # names from the datasheets
+        self._origins: dict[str, dict[str, Any] | None] = {}  # the wrapped sensor of each node
+        self.changes = 0  # incremented when a node's name or datasheet changes
         self._strangers: dict[str, set[str]] = {}
-        self._texts: dict[str, dict[bool, tuple[tuple[int, int], str]]] = {}  # and whether for who may only read
+        # JSON of each node, by True for read-only callers
+        self._texts: dict[str, dict[bool, tuple[tuple[int, int], str]]] = {}
 
     # -- the store ---------------------------------------------------------------------------------------------------
 
@@ -90,11 +92,11 @@ class NodeDirectory:
         """Read the rows of these nodes again, or of all in the store; datasheets when they are requested."""
         try:
             self._refresh(uuids)
-        except StoreError as failure:  # what was read before is shown on; the eye on the store says what is wrong
+        except StoreError as failure:  # the last known rows remain; the daemon's check of the store reports the error
             _log.warning("The nodes cannot be read from the store: %s", failure.message)
 
     def _refresh(self, uuids: Iterable[str] | None) -> None:
-        with self._reading:  # what was read earlier never takes the place of what was read later
+        with self._reading:  # so that an older reading never overwrites a newer one
             every = self._station.overview.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
             wanted = list(every)
             found = list(with_verdicts(self._station, wanted))
@@ -153,14 +155,15 @@ class NodeDirectory:
                 self._own_names[uuid] = sheet.meta.name
                 self._origins[uuid] = _origin(sheet)
 
-    # -- reports of links and measurements ---------------------------------------------------------------------------
+    # -- news from links and measurements ----------------------------------------------------------------------------
 
     def note(self, uuid: str, state: str | None = None, **facts: Any) -> None:
         """Change the facts of a node.
 
         With ``state`` every client gets an event (``came``, ``left``, ``verified`` …).
         """
-        verdict = facts.pop("verdict", None)  # for the event: what is shown is judged from the row of reading
+        # only for the event: the stored reading determines the verdict that is shown
+        verdict = facts.pop("verdict", None)
         with self._lock:
             seen = self._seen.setdefault(uuid, NodePresence())
             seen.version += 1
@@ -282,7 +285,8 @@ class NodeDirectory:
             return known[1]
         node = for_reader(self.node(uuid)) if reader else self.node(uuid)
         text = json.dumps(node, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-        if all(channel["last"] is None and channel["actuator"] is None for channel in node["channels"]):  # else it ages
+        # otherwise the text contains an age
+        if all(channel["last"] is None and channel["actuator"] is None for channel in node["channels"]):
             with self._lock:
                 self._texts.setdefault(uuid, {})[reader] = key, text
         return text
@@ -323,7 +327,7 @@ class NodeDirectory:
             )
         called, unverified = self.published_name(uuid)
         out["unverified"] = unverified
-        if unverified:  # what it calls itself, marked
+        if unverified:  # an unsigned name, marked as such
             out["name"] = out["name"] or called or None
         out["virtual"] = self.virtual(uuid)
         out["wrapped"] = self._origins.get(uuid) or wrapped

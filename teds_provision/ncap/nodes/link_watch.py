@@ -33,14 +33,14 @@ from teds_provision.provisioning.conversation import Conversation, SessionLostEr
 from teds_provision.shapes.problem import Problem, problem_of
 from teds_provision.station.station import Station
 
-# Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
+# Checks whether a node that was seen on a bus is still there: it is asked twice before it counts as gone.
 #
-# Everybody is asked every 30 s only (operation.md section 7), and on a busy machine an answer to that may come too
-# late. So a node that was silent for a while (Waits.silent_node) gets an Identify of its own: at most MAX_PARALLEL a
-# second, once in 10 s each, the bound that the contract sets for nodes that announce themselves.
+# Broadcasts are sent only every 30 s (operation.md section 7), and on a busy machine an answer may come too late. So a
+# node that was silent for a while (Waits.silent_node) gets an Identify of its own: at most MAX_PARALLEL a second, and
+# each node once in 10 s, the limit of the contract for nodes that announce themselves.
 
 MAX_PARALLEL: Final = 5
-PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, and to the second
+PATIENCE: Final = (1.0, 3.0)  # seconds to wait for the first answer, and for the second
 
 
 class PresenceCheck:
@@ -71,7 +71,7 @@ class PresenceCheck:
             try:
                 first = seconds == PATIENCE[0]
                 identity = self._port.identify(last.address, seconds=seconds, until_announced=first)
-            except AddressConflictError:  # a node is there; a conflict is reported by its finder
+            except AddressConflictError:  # a node is there; the code that found the conflict reports it
                 return Sighting(last.identity, last.address, last.port, time.monotonic())
             except LinkError:
                 return None
@@ -87,10 +87,10 @@ STRANGERS: Final = 2
 """Threads that look at nodes which are not on the whitelist: those that are on it never wait for a stranger."""
 MOST_KNOWN: Final = 512
 """Limit of nodes assumed on a bus: it has 239 addresses, but a device may send another UUID each time."""
-STRANGERS_EVERY: Final = 10.0  # seconds between two words about how many strangers there are
+STRANGERS_EVERY: Final = 10.0  # seconds between two events with the number of unlisted nodes
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
-LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
-SILENT: Final = 37.5  # seconds after which a node has left that is not asked by itself
+LOOK_AGAIN: Final = 30.0  # seconds until a node whose inspection failed is inspected again
+SILENT: Final = 37.5  # seconds of silence after which a node without an Identify of its own counts as gone
 LENDING: Final = 10.0
 
 
@@ -137,7 +137,7 @@ class LinkWatch:
         self._taps, self._transparent, self._buses = taps, transparent, buses
         self._trace = trace
         self._known: dict[str, Sighting] = {}
-        self._looked_for: set[str] = set()  # requested again: to be inspected when they answer
+        self._looked_for: set[str] = set()  # nodes to inspect again when they answer
         self._stop, self._anew = threading.Event(), threading.Event()
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
@@ -171,12 +171,13 @@ class LinkWatch:
         """Ask all nodes now, and inspect each of them again."""
         self._anew.set()
 
-    # -- the thread --------------------------------------------------------------------------------------------------
+    # -- the watching thread -----------------------------------------------------------------------------------------
 
     def _run(self) -> None:
         pause = FIRST_PAUSE
         while True:
-            self._anew.clear()  # who stops or borrows after it is heard by what waits, who did before is seen here
+            # cleared first: a stop or a loan from here on sets it again, and an earlier one is noticed below
+            self._anew.clear()
             if self._stop.is_set():
                 return
             if self._borrowers:
@@ -253,14 +254,14 @@ class LinkWatch:
     def on_sighting(self, sighting: Sighting) -> None:
         """Handle a node that answered on this bus; called from the discovery's thread."""
         uuid, identity = sighting.uuid.hex(), sighting.identity
-        before = self._known.pop(uuid, None)  # the latest sighting is last
+        before = self._known.pop(uuid, None)  # removed, so that the newest sighting is added at the end
         self._known[uuid] = sighting
         if len(self._known) > MOST_KNOWN:
             oldest, *_ = list(self._known)
             self._gone(oldest)
         if before is not None:
             seen = self._directory.seen(uuid)
-            here = seen.place == self.place  # it may have been on another bus meanwhile
+            here = seen.place == self.place  # the node may have been on another bus meanwhile
             same = here and (before.address, before.identity.state) == (sighting.address, identity.state)
             retry = seen.problem is not None and abs(time.time() - seen.seen) > LOOK_AGAIN
             if same and not retry and uuid not in self._looked_for:
@@ -279,7 +280,7 @@ class LinkWatch:
         text = f"Node {uuid} no longer answers."
         self._notice(Notice("node-left", text, uuid=bytes.fromhex(uuid)))
 
-    # -- a reader is one command's at a time ---------------------------------------------------------------------------
+    # -- lending the reader to one command -----------------------------------------------------------------------------
 
     def borrow(self, who: object) -> bool:
         """Lend the reader to a command of this machine until it is given back; False if this is no reader."""
@@ -304,7 +305,7 @@ class LinkWatch:
             while self._borrowers and not self._stop.wait(0.1):
                 pass
             self._free.clear()
-            if self._borrowers:  # one that came in that instant was told that the reader is free
+            if self._borrowers:  # another command began to borrow just now and was notified that the reader is free
                 self._free.set()
 
     def _close(self) -> None:
@@ -328,7 +329,7 @@ class LinkWatch:
     def _left(self, uuid: str) -> None:
         if self._directory.stranger(self.place, uuid, there=False) or self._node_locks.holder(uuid) is not None:
             return
-        if self._directory.seen(uuid).place == self.place:  # else it was carried to another link
+        if self._directory.seen(uuid).place == self.place:  # otherwise it was moved to another link
             self._directory.note(uuid, "left", present=False)
 
     def _publish_notice(self, notice: Notice) -> None:
@@ -371,7 +372,7 @@ class LinkWatch:
         uuid = contact.identity.uuid.hex()
         if uuid in self._known:
             self._serve(contact)
-            if uuid not in self._known:  # it left, or others came, while it was looked at
+            if uuid not in self._known:  # it left, or too many others came, during the inspection
                 self._left(uuid)
             return
         with self._guard:
@@ -394,8 +395,9 @@ class LinkWatch:
             with self._node_locks.hold(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
                 if not self._taps.serve_node(node):
                     self._look(node)
-        except FrozenError:  # its measurement verified it, and reports its state
-            if contact.identity.state == NodeState.FACTORY:  # so it may be let go: who adopts looks at it then
+        except FrozenError:  # its measurement has verified it and reports its state
+            # the measurement may release it; inspect it then, so that it can be adopted
+            if contact.identity.state == NodeState.FACTORY:
                 self._looked_for.add(uuid)
             return
         except NodeBusyError as error:
@@ -416,7 +418,7 @@ class LinkWatch:
 
     def _look(self, node: Conversation) -> None:
         if not self._wanted(node.contact):
-            return  # a tap shows which node is there, and no more
+            return  # a tap of an unlisted node shows only which node it is
         found: NodeInspection = look(self._station, node)
         uuid = node.uuid.hex()
         self._directory.show_sheet(uuid, found.sheet)
@@ -447,7 +449,7 @@ class LinkWatch:
             ):
                 found = read_anew(self._station, node)
         except (TedsProvisionError, SessionLostError):
-            return  # it was not read: what is shown stays as it was kept, and is read at the next look
+            return  # the cached datasheet is still shown, and is read again at the next inspection
         except Exception:  # noqa: BLE001 - a worker has no caller to raise to
             _log.exception("Reading the rest of node %s failed.", uuid)
             return

@@ -19,9 +19,9 @@ from teds_provision.links.ports import Contact, Notice
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 
-# One thing at a time with each node: sessions of this process share one address, and a second Open ends the first.
-# A measurement keeps its nodes for as long as it runs; what else is asked of them meanwhile goes through its session,
-# or is refused. Commands of other processes are kept apart by the station's own turns, and by their address.
+# One job at a time with each node: the sessions of this process share one address, and a second Open ends the first. A
+# measurement holds the locks of its nodes while it runs; other requests for them go through its session or are refused.
+# Against commands of other processes there are the station's node locks and the source addresses.
 
 WAIT = 20.0
 
@@ -84,7 +84,7 @@ class NodeLocks:
 
 
 Result = TypeVar("Result")
-FOR_A_TAP: Final = 45.0  # seconds that a request waits for a tap
+FOR_A_TAP: Final = 45.0  # seconds for which a request waits for a tap
 ON_A_BUS: Final = 10.0
 
 
@@ -120,7 +120,7 @@ class NodeJob(Generic[Result]):
         except TedsProvisionError as error:
             self.error = error
         except Exception as error:
-            self.error = as_program_error(error)  # else the waiter takes it for done
+            self.error = as_program_error(error)  # otherwise the waiting thread would assume success
             raise
         finally:
             self.done.set()

@@ -125,8 +125,8 @@ class Provisioning:
             before = self._runs.get(uuid)
             if before is not None and before.state in ("waiting", "running"):
                 raise UsageError(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
-            run = self._runs[uuid] = ProvisioningRun(uuid)  # at once: a second request meanwhile is refused
-        # The text of a calibration, as the file that the steps read; it is there until the run has ended.
+            run = self._runs[uuid] = ProvisioningRun(uuid)  # registered at once, so that a second request is refused
+        # The steps read the calibration from a file, which is kept until the run has ended.
         folder: tempfile.TemporaryDirectory[str] | None = None
         try:
             folder = tempfile.TemporaryDirectory(prefix="ncap-")
@@ -158,7 +158,7 @@ class Provisioning:
         who = ACTOR.get()
 
         def work(node: Conversation) -> None:
-            with acting_for(who):  # the requester, when a node comes to another thread
+            with acting_for(who):  # the actor of the request, since this may run in another thread
                 self._work(run, node, order)
 
         if uuid != NEXT and self._node_jobs.on_a_bus(uuid):
@@ -182,7 +182,7 @@ class Provisioning:
             self._publish(run)
         return run.as_json()
 
-    # -- the ways to the node ----------------------------------------------------------------------------------------
+    # -- reaching the node -------------------------------------------------------------------------------------------
 
     def _wait_for_a_tap(
         self, run: ProvisioningRun, work: Callable[[Conversation], None], clean: Callable[[], None]
@@ -219,7 +219,7 @@ class Provisioning:
                 self._fail(run, problem_of(refusal))
                 clean()
                 return
-            run.steps.clear()  # this node takes a key at a reader alone
+            run.steps.clear()  # this node accepts a key only at a reader
             self._wait_for_a_tap(run, work, clean)
         except TedsProvisionError as error:
             self._fail(run, problem_of(error))
@@ -240,14 +240,14 @@ class Provisioning:
         self._publish(run)
         reporter = _RunReporter(run, self._live)
         try:
-            # A request for this very node, or for the one that is about to be tapped, has accepted its key.
+            # The caller accepted the node's key by requesting this node, or the next one that is tapped.
             done: ProvisionResult = provision(self._station, node, order, operator=_APPROVED, reporter=reporter)
         except SessionLostError as lost:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
         require_authentic(done.verified)
         _show_verified(self._directory, uuid, done.verified)
-        run.state = "done"  # last: who hears it asks for the node next
+        run.state = "done"  # set last: a client that sees it may request the node at once
         self._publish(run)
 
     def _fail(self, run: ProvisioningRun, error: Problem) -> None:
@@ -322,9 +322,9 @@ def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
     return path
 
 
-# Nodes that are provisioned without a request: virtual transducers of this station, whose key it made itself; and
-# factory nodes of a wired bus where the operator said so (`--adopt`, transparent mode; operation.md section 7,
-# assurance ``bus``).
+# Nodes that are provisioned without a request: virtual transducers of this station, which made their keys; and factory
+# nodes on a wired bus if the operator chose that (`--adopt`, transparent mode; operation.md section 7, assurance
+# ``bus``).
 
 
 class AutoProvisioner:
@@ -367,14 +367,14 @@ class AutoProvisioner:
         ):
             who = identify(self._station, node)
             listed = len(list_blocks(node))
-            if listed > STRANGERS_TEDS:  # once it has a key, all of them would be read, again and again
+            if listed > STRANGERS_TEDS:  # once adopted, the node would have all of them read again and again
                 raise BadDataError(
                     f"Node {uuid} lists {listed} TEDS; one with more than {STRANGERS_TEDS} is not adopted."
                 )
             entry = None if who.whitelisted is not None else new_whitelist_entry(self._station, node, who)
             with self._station.node_lock(node.uuid):
                 agreed = agree(self._station, node, who, newcomer=entry)
-            # else it would be looked at as the stranger that it was, and found unproven
+            # With the old identity, the node would be inspected as one without a key, and found unproven.
             node.identity = replace(node.identity, state=NodeState.KEYED, epoch=agreed.epoch)
             self._station.audit("adopt", node.uuid, "done", fingerprint=who.fingerprint)
             self._live.event("node", uuid=uuid, state="adopted")

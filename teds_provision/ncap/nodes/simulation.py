@@ -23,7 +23,7 @@ SIMULATION: Final = "simulation"
 SOCKET: Final = "source.sock"
 MOST_OCTETS: Final = 1 << 20
 """Octets a second of one simulation: beyond them its lines are read no faster."""
-_BURST: Final = 0.25  # seconds of that rate that may come at once
+_BURST: Final = 0.25  # a burst may contain this many seconds of that rate
 
 
 @dataclass

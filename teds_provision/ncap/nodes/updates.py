@@ -107,13 +107,13 @@ class Updates:
         self._slots: dict[str, threading.Semaphore] = {}
         self._told: dict[str, float] = {}
 
-    # -- its life ----------------------------------------------------------------------------------------------------
+    # -- start and end -----------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Read what is kept, and go on with the action that was cut."""
         self._actions = {action.id: action for action in self._kept.read()}
         running = [action for action in self._actions.values() if action.state == "running"]
-        for action in running[1:]:  # one at a time: a second one can only be a copied file
+        for action in running[1:]:  # only one action runs at a time, so a second one comes from a copied file
             self._end(action, "stopped")
         if running:
             try:
@@ -134,7 +134,7 @@ class Updates:
             if self._work is not None:
                 self._work.drop_waiting()
 
-    # -- what the API asks -------------------------------------------------------------------------------------------
+    # -- for the API -------------------------------------------------------------------------------------------------
 
     def all(self) -> list[dict[str, Any]]:
         """Return every action that is known, the newest first."""
@@ -242,7 +242,7 @@ class Updates:
                 plan = plan_at(self._station, port, node, order, SilentReporter(), timeout=_PLANNED_WITHIN)
         except SessionLostError as lost:
             raise lost.cause from lost
-        if plan.interrupts:  # of another process, which lets go of nothing
+        if plan.interrupts:  # measured by another process, which does not release nodes
             raise FrozenError(
                 f"Node {uuid} is being measured by {plan.interrupts[0]}.", hint="End that measurement first."
             )
@@ -264,7 +264,7 @@ class Updates:
                 if trusted is not None and trusted.node.sealed:
                     require_free_actuators(trusted.node)
         except FrozenError:
-            return  # it gives no values now, and so takes no set points either
+            return  # it is suspended, so no set points arrive either
         except SessionLostError as lost:
             raise lost.cause from lost
 
@@ -276,7 +276,7 @@ class Updates:
             action.rows[uuid].state, action.rows[uuid].step = "waiting", None
 
         def one(uuid: str) -> BoardUpdate:
-            with acting_for(action.actor):  # on whose word, for the audit log
+            with acting_for(action.actor):  # the actor for the audit log
                 return self._update(action, image, uuid)
 
         work = self._work = ParallelWork(left, one, at_once=action.request.parallel, name="update")
@@ -295,7 +295,7 @@ class Updates:
             else:
                 done = finished.result()
             if self._closing.is_set() and done.error is not None:
-                continue  # the service ends its links, and the board goes on at the next start
+                continue  # the failure comes from closing the links; the update continues at the next start
             with self._guard:
                 row = action.rows[finished.item]
                 self._put_end(row, done)

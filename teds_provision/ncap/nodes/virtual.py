@@ -175,7 +175,7 @@ class Virtuals:
         teds: Path | None = None
         if content is not None:
             teds = folder / "datasheet"
-            placed(content.encode())  # its own message names the fault, not the file's
+            placed(content.encode())  # raises an error about the content, not about the temporary file
             teds.write_text(content, encoding="utf-8")
         stated = stated_uuid(placed(content.encode())) if content is not None and on_bus is not None else None
         uuid_ = None if stated else self._new_uuid()
@@ -284,9 +284,9 @@ class Virtuals:
         one, octets, station = self._virtual_of(uuid), bytes.fromhex(uuid), self._station
         with station.durable("virtual"):
             station.pins.remove(octets)
-            station.keys.remove(octets)  # the node's own copy goes with its folder: nothing could be opened with it
+            station.keys.remove(octets)  # the node's own copy is deleted with its folder, so this key would be useless
             station.datasheets.drop_draft(octets)
-            if station.nodes.get(octets) is not None:  # its name is free again
+            if station.nodes.get(octets) is not None:  # frees its name
                 station.nodes.remember(octets, name=None, retired=DECOMMISSIONED)
             station.measurements.hand_on(octets, None)
             station.audit("virtual", octets, "removed")

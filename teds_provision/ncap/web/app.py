@@ -203,7 +203,7 @@ async def _end_in_time(socket: WebSocket, daemon: Daemon, caller: Caller, leavin
             code, why = _NOT_GOOD, "This token is invalid or has expired."
         else:
             continue
-        with suppress(WebSocketDisconnect, RuntimeError, OSError):  # it has gone by itself
+        with suppress(WebSocketDisconnect, RuntimeError, OSError):  # the client may have left already
             await socket.close(code, why)
         return
 
@@ -211,7 +211,7 @@ async def _end_in_time(socket: WebSocket, daemon: Daemon, caller: Caller, leavin
 def _is_good(tokens: Tokens, digest: str) -> bool:
     try:
         return tokens.is_good(digest)
-    except StoreError:  # an unreadable file admits no client, nor lets one stay
+    except StoreError:  # while the file is unreadable, no token is accepted
         return False
 
 
@@ -222,4 +222,4 @@ async def _send(socket: WebSocket, listener: LiveClient, hello: dict[str, Any]) 
             for text in await listener.wait():
                 await socket.send_text(text)
     except (WebSocketDisconnect, RuntimeError, OSError):
-        return  # it has gone; the receiving side sees that too
+        return  # the client has left; the receiving side notices that too

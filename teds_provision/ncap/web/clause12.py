@@ -119,7 +119,7 @@ class Clause12:
 
     def _uuid(self, given: dict[str, str]) -> str:
         word = given.get("timid", "")
-        self.tims({})  # numbers are given in the order in which nodes are seen
+        self.tims({})  # assigns numbers in the order in which nodes are seen
         found = next((uuid for uuid, number in self._tims.items() if str(number) == word), None)
         if found is not None:
             return found

@@ -38,7 +38,7 @@ _UPDATES: Final = f"{API}/updates"
 _WRONG_TOKENS: Final = 10
 _WRONG_WITHIN: Final = 60.0
 _SLOWED: Final = 1.0
-_MOST_SLOWED: Final = 50  # at once; each of them holds one of the places that all requests share
+_MOST_SLOWED: Final = 50  # at once; each one uses one of the places that all requests share
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _CSP: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -198,7 +198,7 @@ class Guard:
         if len(self._wrong) > _WRONG_TOKENS:
             if len(self._wrong) > 10 * _WRONG_TOKENS:
                 self._wrong.popleft()
-            await self._slow_down()  # a right token is never slowed down: no client can lock the others out
+            await self._slow_down()  # requests with a good token are never delayed, so a client cannot lock others out
             return RequestRefusedError(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
         return RequestRefusedError(
             401, "wrong-token", "This token is invalid or has expired.", "Get a new one: teds-provision ncap open"
@@ -225,7 +225,8 @@ def _headers(scope: Scope) -> dict[str, str]:
         if key in found and key in ("host", "origin", "content-length", "content-type", "authorization"):
             raise RequestRefusedError(400, "usage", f"Header {key} appears twice.")
         found[key] = value.decode("latin-1") if key not in found else f"{found[key]}; {value.decode('latin-1')}"
-    if "content-length" in found and "transfer-encoding" in found:  # RFC 9112, section 6.3: who reads which is unknown
+    # RFC 9112, section 6.3: proxies and servers may disagree which one applies
+    if "content-length" in found and "transfer-encoding" in found:
         raise RequestRefusedError(
             400,
             "usage",

@@ -52,7 +52,8 @@ def text(status: dict[str, Any], parts: Iterable[ServicePart] = ()) -> str:
     """Return the status, and the metrics of parts that optional rooms bring, in Prometheus's form."""
     parts = tuple(parts)
     help_of = {**_HELP, **{name: told for part in parts for name, told in part.metric_help.items()}}
-    lines: dict[str, dict[str, float]] = {name: {} for name in help_of}  # of equal labels one line: two end a scrape
+    # one line for equal labels: a duplicate would make the whole scrape fail
+    lines: dict[str, dict[str, float]] = {name: {} for name in help_of}
     for name, labels, value in chain(_lines(status), *(part.metrics() for part in parts)):
         inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in labels.items())
         lines[name].setdefault(f"{name}{{{inner}}}" if inner else name, value)

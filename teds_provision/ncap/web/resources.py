@@ -46,7 +46,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 _LENT_LOOK: Final = 0.5
 _STILL: Final = client.LETTING_GO / 3  # seconds between two lines to a command that waits for a node
 _OF_UPDATES: Final = ("nodes", "match", "dry_run", "other_board", "allow_downgrade", "parallel", "wait")
-_DIGITS: Final = 9  # of a number in a query; Python gives up on four thousand
+_DIGITS: Final = 9  # of a number in a query; Python raises an error for four thousand
 _UNIX: Final = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
 
 
@@ -185,7 +185,7 @@ class Resources:
                 for watch in watches:
                     await asyncio.to_thread(watch.borrow, request)
                 yield "lent\n"
-                while True:  # a client that has gone is seen when it is written to
+                while True:  # writing shows whether the client is still there
                     await asyncio.sleep(_LENT_LOOK)
                     yield ".\n"
             finally:
@@ -218,7 +218,8 @@ class Resources:
 
         async def had() -> AsyncIterator[str]:
             lending = asyncio.ensure_future(changing(lend))
-            lending.add_done_callback(lambda done: done.cancelled() or done.exception())  # the client may have gone
+            # the client may have left, so retrieve the exception here
+            lending.add_done_callback(lambda done: done.cancelled() or done.exception())
             try:
                 try:
                     while not (await asyncio.wait({lending}, timeout=_STILL))[0]:
@@ -227,10 +228,10 @@ class Resources:
                 except TedsProvisionError as error:
                     yield f"refused: {error.message}\n"
                     return
-                while time.monotonic() < until:  # a client that has gone is seen when it is written to
+                while time.monotonic() < until:  # writing shows whether the client is still there
                     await asyncio.sleep(_LENT_LOOK)
                     yield ".\n"
-            finally:  # nothing can be awaited here: the client may have gone
+            finally:  # not awaited: the client may have left
                 asyncio.get_running_loop().run_in_executor(None, measuring.return_node, loan)
 
         return StreamingResponse(had(), media_type="text/plain")
@@ -433,7 +434,7 @@ class Resources:
         source = body.source or "noise"
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket" and source.startswith(("file:", "unix:")):
-            # An error about a file quotes a piece of it: no token reads this user's files.
+            # An error about a file quotes a part of it, and a token must not give access to this user's files.
             raise PolicyError(
                 "A file or socket can only be named as a source on the station's own machine.",
                 hint="Use noise, sine:S, ramp:S or simulation.",
@@ -523,7 +524,8 @@ def _moment(name: str, text: str) -> str:
     """Return a parameter as the log writes moments: ISO 8601 with a zone, or unix seconds."""
     try:
         at = datetime.fromtimestamp(float(text), UTC) if _UNIX.fullmatch(text) else datetime.fromisoformat(text)
-        return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))  # a zone may leave the years that there are
+        # with its zone, the year may be out of range
+        return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))
     except (ValueError, OverflowError, OSError):
         raise UsageError(f"{name} must be a time such as 2026-11-22T10:00:00Z, or unix seconds.") from None
 

@@ -53,7 +53,7 @@ _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
 ASKED: Final = "teds.asked"
 """Key in a request's scope of the short members of its body, for the audit log."""
 _LONGEST_IN_LOG, _MOST_IN_LOG = 200, 16
-_OTHERS: Final = 422  # guard, limits, bad data, policy: the request is understood and not done
+_OTHERS: Final = 422  # guard, limits, bad data, policy: the request was understood but refused
 
 
 def status_of(error: TedsProvisionError) -> int:
@@ -120,5 +120,5 @@ async def moving(work: Callable[_Words, _Found], *words: _Words.args, **more: _W
 
 
 async def _run(pool: ThreadPoolExecutor, work: Callable[[], _Found]) -> _Found:
-    who = contextvars.copy_context()  # on whose word it is done, for the audit log
+    who = contextvars.copy_context()  # keeps the actor for the audit log
     return await asyncio.get_running_loop().run_in_executor(pool, lambda: who.run(work))

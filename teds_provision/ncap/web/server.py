@@ -17,11 +17,11 @@ from teds_provision.errors import LinkError
 from teds_provision.ncap.settings import Settings
 from teds_provision.ncap.web.guard import CALLER, App
 
-# One connection of HTTP: a client that opens it and sends nothing, or sends slowly, loses it.
+# HTTP connections with time limits: a client that connects and sends nothing, or sends slowly, is disconnected.
 #
-# uvicorn waits without end for the end of a request's head and body. Its limit of connections would then keep everybody
-# out, by no more than so many sockets of a program that has no token. So where there are too many, those that have not
-# shown a good token go first, whatever they are sending.
+# uvicorn waits without limit for the end of a request's head and body. A program without a token could open enough
+# sockets to reach its limit of connections, and so lock out all other clients. So if there are too many connections,
+# those without a good token are closed first, whatever they are sending.
 
 MOST: Final = 500
 """Connections at once; of more than these the oldest without a good token is ended, else the one silent longest."""
@@ -60,7 +60,7 @@ class HttpConnection(H11Protocol):
         if useless:
             min(useless, key=lambda http_connection: http_connection._began).end()
         else:
-            self.limit_concurrency = MOST  # all of them have a running request: 503
+            self.limit_concurrency = MOST  # all connections have a running request: reply 503
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Handle the end of a connection."""
@@ -158,7 +158,7 @@ class Servers:
             ws_max_size=LONGEST_MESSAGE,
             ws_per_message_deflate=False,
             timeout_keep_alive=30,
-            limit_concurrency=4 * MOST,  # of requests; one of which the connection was ended counts for a moment more
+            limit_concurrency=4 * MOST,  # of requests; one whose connection was closed counts for a moment longer
             timeout_graceful_shutdown=_ENDING,
             h11_max_incomplete_event_size=32_768,
             ssl_certfile=tls.certificate if tls else None,

@@ -23,9 +23,9 @@ from teds_provision.ncap.nodes.virtual import Virtual, opened_folder, short_path
 from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError
 from teds_provision.ncap.web.responses import changing, status_of
 
-_STARTING: Final = 10.0  # seconds that a transducer's process has to start
+_STARTING: Final = 10.0  # seconds for a transducer's process to start
 _AGAIN: Final = 0.2
-_NEWS: Final = 1.0  # seconds between two messages about lines that were skipped
+_NEWS: Final = 1.0  # seconds between two messages about skipped lines
 _GONE: Final = 1012  # the transducer was restarted or removed
 
 Watch = Callable[[WebSocket, Caller, asyncio.Event], Awaitable[None]]
@@ -125,7 +125,7 @@ class _Session:
     async def _receive_lines(self) -> None:
         ready = {"ready": True, "channels": [channel.as_json() for channel in self.channels], "limit": MOST_OCTETS}
         lines, pace = CheckedLines(self.channels), Pace()
-        with suppress(WebSocketDisconnect, RuntimeError, OSError):  # it has gone by itself
+        with suppress(WebSocketDisconnect, RuntimeError, OSError):  # the client may have left already
             await self.socket.send_json(ready)
             while self.socket.client_state is WebSocketState.CONNECTED:
                 with suppress(TimeoutError):

@@ -118,7 +118,8 @@ class Peripheral:
         with suppress(Exception):
             await self._device.stop_advertising()
             await self._device.power_off()
-        await asyncio.to_thread(_finish_turns, lines)  # the workers' end drops what waits: a session would not end
+        # before the workers end: they would drop queued jobs, and a session would not be closed
+        await asyncio.to_thread(_finish_turns, lines)
         await asyncio.to_thread(self._workers.end)
 
     def tapped(self) -> None:
@@ -131,7 +132,7 @@ class Peripheral:
         line = self._lines.get(number)
         if line is not None and line.hears:
             await self._device.notify_subscriber(line.connection, self._data, octets)
-            with suppress(Exception):  # the connection ends meanwhile
+            with suppress(Exception):  # the connection may end meanwhile
                 await line.connection.drain()
 
     # -- advertising -----------------------------------------------------------------------------------------------
@@ -201,7 +202,7 @@ class Peripheral:
         number = next(free for free in range(_FIRST_SOURCE, 256) if free not in self._lines)
         line = self._lines[number] = CentralState(number, connection, self._workers)
         connection.on("disconnection", lambda _reason: self._disconnected(line))
-        self._advertising = False  # a controller stops when somebody connects
+        self._advertising = False  # a controller stops advertising when a central connects
         self._news.set()
 
     def _disconnected(self, line: CentralState) -> None:
@@ -219,7 +220,7 @@ class Peripheral:
             task.add_done_callback(self._dropping.discard)
 
     async def _drop(self, line: CentralState) -> None:
-        with suppress(Exception):  # it was going anyway
+        with suppress(Exception):  # the connection may have ended already
             await asyncio.wait_for(line.connection.disconnect(), 2.0)
         self._disconnected(line)
 
@@ -258,7 +259,7 @@ class Peripheral:
             try:
                 reply = line.repetition.answer(received.transaction, received.message, run, now=time.monotonic())
             except TedsProvisionError:
-                return  # a node in trouble (its flash file is gone) is silent
+                return  # a node that fails (its flash file is gone) does not reply
             finally:
                 line.waiting -= 1
             sent = asyncio.run_coroutine_threadsafe(self._reply(line, received.transaction, reply), loop)

@@ -24,9 +24,9 @@ from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, Reply, refusal
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
 
-# Who has which address on a CAN bus: nodes of one process, their Announces, claims that meet (profile.md, "CAN").
+# CAN addresses: the nodes of one process, their Announces, and conflicting claims (profile.md, "CAN").
 #
-# Nothing here is thread-safe: the server of the bus calls it under its lock.
+# Nothing here is thread-safe: the bus server calls it under its lock.
 
 
 class EndpointTable:
@@ -95,7 +95,7 @@ class EndpointTable:
         if announce is None:
             return
         for endpoint in list(self.at(announce.address)):
-            own = self._echoes and announce.crc == endpoint.claim.crc  # given back by a controller that does so
+            own = self._echoes and announce.crc == endpoint.claim.crc  # an echo of our own Announce
             if endpoint is not speaker and not (speaker is None and own):
                 self._contested(endpoint, announce)
 
@@ -226,7 +226,7 @@ class CanServer:
         """Close the bus and end the state of every station; never raises."""
         self._stop.set()
         if self._thread is not None and self._wake is not None:
-            self._wake.close()  # which the loop notices at once
+            self._wake.close()  # the loop notices this at once
             self._thread.join(timeout=3)
             self._thread = None
         if self._workers is not None:
@@ -368,7 +368,7 @@ class CanServer:
     def _from_station(self, station: int, frame: Frame) -> None:
         if frame.identifier & 0x1FFFFF00 == FUNCTIONAL:
             body = read_single(frame.data)
-            if body is not None and body[1:] == IDENTIFY.encode():  # nothing else that is asked of everyone is answered
+            if body is not None and body[1:] == IDENTIFY.encode():  # the only command that is answered to a broadcast
                 for endpoint in self._endpoints:
                     self._everyone(endpoint, station, body[:1], fd=frame.fd)
             return
@@ -381,7 +381,7 @@ class CanServer:
             state, pair = endpoint.pair(station, own)
             self._command_frame(endpoint, state, pair, frame)
         if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
-            # A reply that is still leaving from the address before 128.10 needs its flow control.
+            # A reply in progress from the address before 128.10 still needs its flow control.
             for endpoint, pair in list(self._active):
                 if pair.own == own and pair.peer == station and endpoint.address != own and pair.sending:
                     pair.handle_frame(frame)
@@ -389,14 +389,14 @@ class CanServer:
 
     def _command_frame(self, endpoint: CanEndpoint, state: StationState, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
-        if begun is not None and begun.length > endpoint.max_message + 1:  # refused in place of a flow control
+        if begun is not None and begun.length > endpoint.max_message + 1:  # refused instead of flow control
             answer = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
             self._out(endpoint, Frame(physical_id(pair.peer, pair.own), answer, frame.fd))
             return
         pair.handle_frame(frame)
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:
-                pair.stop_sending()  # a station that repeats its request has not taken that answer
+                pair.stop_sending()  # a new request from this station means that it no longer waits for that answer
             received = endpoint.measuring_handler.tick(frame.at) if endpoint.measuring_handler is not None else 0
             state.put(functools.partial(self._run_request, state, pair, EndpointRequest(body, frame.fd, received)))
         self._schedule(endpoint, pair)
@@ -422,26 +422,26 @@ class CanServer:
         try:
             reply = state.answer(request)
         except TedsProvisionError:
-            return  # a node in trouble (its flash file is gone) is silent
+            return  # a node that fails (its flash file is gone) does not reply
         finally:
             with self._lock:
                 state.waiting -= 1
         with self._lock:
-            if state.endpoint.address != state.endpoint.handler.can_address():  # 128.10
+            if state.endpoint.address != state.endpoint.handler.can_address():  # command 128.10 changed it
                 state.endpoint.address = state.endpoint.handler.can_address()
                 state.endpoint.claim.relocated()
                 self._addresses.find()
             if self._stop.is_set() or state.gone or state.pairs.get(pair.own) is not pair:
-                return  # lost meanwhile
+                return  # the station was lost meanwhile
             self._end_answer_to_everyone(state, pair)
             try:
                 pair.send(reply)
             except LinkError:
-                return  # the reading thread meets the same failure and deals with it
+                return  # the reading thread gets the same failure and handles it
             state.replying = pair
             self._schedule(state.endpoint, pair)
 
-    # -- everyone --------------------------------------------------------------------------------------------------
+    # -- broadcasts ------------------------------------------------------------------------------------------------
 
     def _everyone(self, endpoint: CanEndpoint, station: int, transaction: bytes, *, fd: bool) -> None:
         """Answer a functional Identify after a random wait; a newer one of the same station takes its place."""
@@ -453,8 +453,8 @@ class CanServer:
             if self._everyone_due.get(state) != number or state.gone or endpoint.address != own:
                 return
             if state.replying is not None:
-                # A reply ends within N_Bs even if its station was killed. Answers queued behind it would be late for
-                # good: each would wait for the one before, and the station drops what answers an older question.
+                # A reply ends within N_Bs even if its station was killed. Do not queue answers behind it: each would
+                # wait for the one before, and the station drops answers to an older broadcast.
                 self._at_time(time.monotonic() + _SPREAD_SECONDS, answer)
                 return
             del self._everyone_due[state]

@@ -67,7 +67,8 @@ class ImageSlots:
             write_whole(own / _KEY, public_pem(load_key(key)))
             write_whole(own / _SLOTS["a"], first.octets)
             write_whole(own / _SLOTS["b"], b"")
-            _write_state(own, BootState(counter=first.security_counter or 0))  # last: now it has slots
+            # written last: the slots exist only with a complete state
+            _write_state(own, BootState(counter=first.security_counter or 0))
         slots = cls(folder)
         slots.start()
         return slots
@@ -85,7 +86,7 @@ class ImageSlots:
         Raises BadDataError, NotAuthenticError if the only image does not verify: such a board does not start.
         """
         state = self._state
-        if state.trial:  # it ran once and was not confirmed
+        if state.trial:  # it was not confirmed during its trial
             state = replace(state, running=_OTHER[state.running], trial=False, pending=None)
         else:
             state = replace(state, counter=max(state.counter, self._verified(state.running).security_counter or 0))
@@ -110,7 +111,7 @@ class ImageSlots:
     def _verified(self, slot: str) -> FirmwareImage:
         return read_firmware_image(self._octets(slot), self._key)
 
-    # -- what the running image sees -------------------------------------------------------------------------------
+    # -- for the running image -------------------------------------------------------------------------------------
 
     @property
     def running(self) -> FirmwareImage:

@@ -22,7 +22,7 @@ from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
-# The battery of a virtual transducer: charged in a reader's field, emptied outside it (operation.md section 7).
+# The battery of a virtual transducer: charged in a reader's field, discharged outside it (operation.md section 7).
 
 TOO_LOW: Final = 5.0
 """Per cent below which the node does not measure."""
@@ -177,7 +177,7 @@ class Board:
             return RawReading(bytes(converter.form.octets), valid=False)
         try:
             return RawReading(converter.octets(given))
-        except BadDataError:  # no way from a value to a sample: nothing that could be shown
+        except BadDataError:  # the curve has no inverse here, so there is no sample
             return RawReading(bytes(converter.form.octets), valid=False)
 
     @property

@@ -43,7 +43,7 @@ class Converter:
         self._most = (1 << bits) - 1 if self.form.integer or self.form.model == DataModel.BITS else None
         self._packing = _PACKING.get(DataModel(self.form.model))
         self._turn = self._interpreter.turn
-        # If values wrap, those that the curve gives begin with its raw numbers, not at LowLimit.
+        # If values wrap, the curve's range begins at its first raw number, not at LowLimit.
         self._from, self._to = self.low, self.high
         if self._turn < math.inf and not self._interpreter.problem:
             self._from, high = self._interpreter.given or (self.low, self.high)

@@ -16,10 +16,11 @@ from teds_provision.node.nfc import tags as nfc_type2
 from teds_provision.node.nfc import tags as nfc_type4
 from teds_provision.node.nfc.tnep import NO_EXTRAS, ExtraRecords, TnepTag
 
-# What ISO/IEC 14443-3 Type A frames take on air at 106 kbit/s, to imitate the link in benchmarks.
+# The duration of ISO/IEC 14443-3 Type A frames on air at 106 kbit/s, to imitate the link in benchmarks.
 #
 # One etu is 128/13.56 MHz (9.44 µs). A standard frame has a start bit, 8 bits and parity per octet, and an end; the
-# frame delay times are those of ISO/IEC 14443-3 clause 6.2 (n = 9, last bit 1) and of the answer's other direction.
+# frame delay times are those of ISO/IEC 14443-3 clause 6.2 (n = 9, last bit 1), and of the answer in the other
+# direction.
 
 ETU = 128 / 13.56e6  # seconds
 _TO_TAG, _TO_READER = (9 * 128 + 84) / 13.56e6, 1172 / 13.56e6  # frame delay times, seconds
@@ -64,9 +65,9 @@ class AirTime:
                 time.sleep(left - _SPIN)
 
 
-_LISTEN = 0.25  # seconds after which the server looks around: stop, renewal of the initial message
+_LISTEN = 0.25  # seconds between checks for a stop or a renewal of the initial message
 _QUEUE = 0.2  # seconds between two tries to be placed on an occupied reader
-_LEAVING = 1.0  # seconds that a node before is given to leave
+_LEAVING = 1.0  # seconds for the node before to leave the reader
 _SENS_RES = {4: b"\x04\x00", 7: b"\x44\x00", 10: b"\x84\x00"}
 TYPE4_MAX_NDEF = 4160  # a frame of 4094 octets in one message
 

@@ -17,7 +17,7 @@ _NDEF_APPLICATION = bytes.fromhex("D2760000850101")
 _CC_FILE, _NDEF_FILE = b"\xe1\x03", b"\xe1\x04"
 _FSD = (16, 24, 32, 40, 48, 64, 96, 128, 256)
 _SELECT, _READ_BINARY, _UPDATE_BINARY = 0xA4, 0xB0, 0xD6
-_LONGEST_APDU = 261  # a longer chain is cut, and so refused
+_LONGEST_APDU = 261  # a longer chain is cut, and is then refused
 _WTX: Final = b"\xf2\x01"  # S(WTX), one more frame waiting time
 _OK, _WRONG_LENGTH, _NO_FILE, _NOT_ALLOWED = b"\x90\x00", b"\x67\x00", b"\x6a\x82", b"\x69\x86"
 _WRONG_OFFSET, _NO_SPACE, _NO_COMMAND = b"\x6b\x00", b"\x6a\x84", b"\x6d\x00"
@@ -132,10 +132,11 @@ class IsoDepTag:
 
     def answer(self, block: bytes) -> bytes | None:
         """Return the block that answers ``block``, None for silence."""
-        pcb = block[0]  # with CID or NAD, which our ATS does not offer, it is for another card (ISO/IEC 14443-4, 7.1)
+        # blocks with CID or NAD, which our ATS does not offer, are for another card (ISO/IEC 14443-4, 7.1)
+        pcb = block[0]
         if pcb & 0xEE == 0x02:
             return self._information_block(pcb, block[1:])
-        if pcb & 0xFE == 0xB2:  # R(NAK): our last block again, or "I heard nothing"
+        if pcb & 0xFE == 0xB2:  # R(NAK): the last block again, or none was received
             return self._last if pcb & 1 == self._number and self._last else bytes((0xA2 | self._number,))
         if pcb & 0xFE == 0xA2:  # R(ACK): the next part of a chain
             return self._acknowledged(pcb & 1)
@@ -156,7 +157,7 @@ class IsoDepTag:
 
     def _information_block(self, pcb: int, octets: bytes) -> bytes:
         self._number ^= 1
-        self._parts = []  # a reader that starts over wants no more of the answer before
+        self._parts = []  # a reader that starts again drops the answer before
         self._received = (self._received + octets)[:_LONGEST_APDU]
         if pcb & 0x10:
             return self._remember(bytes((0xA2 | self._number,)))
@@ -181,11 +182,11 @@ class IsoDepTag:
         return block
 
 
-# A Type 2 tag as a state machine, in the layout of the NHS31xx family: 512 octets of SRAM behind 16 of header.
+# A Type 2 tag as a state machine, in the layout of the NHS31xx family: 512 octets of SRAM after 16 of header.
 #
-# The data area begins with a lock control TLV ``01 03 E8 0E 46`` and a proprietary TLV ``FD 01 00``; the NDEF TLV
-# stands on RF page 6, and a length other than 0 written there completes a message (facts from NXP's public SDK
-# headers; the octets of the capability container are an inference). What lies behind the SRAM is not there.
+# The data area begins with a lock control TLV ``01 03 E8 0E 46`` and a proprietary TLV ``FD 01 00``; the NDEF TLV is on
+# RF page 6, and writing a length other than 0 there completes a message (facts from NXP's public SDK headers; the
+# octets of the capability container are an inference). There is no memory after the SRAM.
 
 MAX_NDEF = 499  # 512 - 8 (the two TLVs) - 4 (TLV type and length) - 1 (terminator)
 TYPE_2_SAK: Final = 0x00

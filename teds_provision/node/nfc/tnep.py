@@ -23,11 +23,11 @@ from teds_provision.node.handler import NodeHandler
 from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.repetition import Repetition
 
-# What the initial NFC message of a node says beside the profile's records: charge, and where it is in the air.
+# Records that a node's initial NFC message adds to the profile's: charge, and its out-of-band address.
 #
-# Records of NFC Forum WLC 2.0 as open sources read them (the layouts are those of operation.md section 7 and of what
-# sold tags show): ``WLCCAP`` stands first, ``WLCSTAI`` after it, both in static mode, so that the mailbox stays
-# TNEP's. All of it is a hint.
+# Records of NFC Forum WLC 2.0 as open sources decode them (operation.md section 7 has the layouts, which agree with
+# tags on the market): ``WLCCAP`` comes first, then ``WLCSTAI``, both in static mode, so that TNEP keeps the mailbox.
+# All of it is a hint.
 
 CAPABILITY, STATUS, POLLER = b"WLCCAP", b"WLCSTAI", b"WLCINF"
 _VERSION: Final = 0x20
@@ -119,13 +119,13 @@ class TnepTag:
         self._extras = extras
         self._responder = Responder(self._run)
         self._lock = threading.Lock()
-        self._serial = 0  # of the activation or message that the mailbox belongs to
+        self._serial = 0  # number of the activation or message to which the mailbox belongs
         self._selected = False
         self._fresh = threading.Event()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._worker = threading.Thread(target=self._work, name="nfc-node", daemon=True)
         self._initial = b""
-        self._shown: bytes | None = None  # the initial message in the mailbox, None for any other
+        self._shown: bytes | None = None  # the initial message in the mailbox; None if it holds another one
         memory.written = self._written
 
     def start(self) -> None:

@@ -33,7 +33,7 @@ class CommandSource(LineSource):
                 self._words,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                start_new_session=True,  # Ctrl-C is for the node, which then ends its program
+                start_new_session=True,  # Ctrl-C is for the node, which then ends this program
             )
         except OSError as error:
             raise NotFoundError(f"The program {self._words[0]} cannot be started: {error.strerror}.") from error

@@ -41,7 +41,7 @@ class LineSource:
         self._drive: SimulationClock | None = None
         self._last: float | None = None
         self._offset = 0.0
-        self.latest: Mapping[int, Reading | None] = {}  # those of the last line that was taken
+        self.latest: Mapping[int, Reading | None] = {}  # of the last accepted line
         self.dropped = 0
 
     def at(self, channel: int, seconds: float) -> Reading | None:
@@ -110,7 +110,7 @@ class LineSource:
             return ""
         if not _is_seconds(time):
             return '"t" is not a number of seconds of 0 or more'
-        if self._last is None:  # if the node's clock is further already, this one goes on from there
+        if self._last is None:  # continue from the node's clock if it is ahead
             self._drive.own_clock()
             self._offset = max(0.0, self._drive.now() - time)
         elif time < self._last:

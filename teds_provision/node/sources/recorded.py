@@ -35,7 +35,7 @@ class RecordedSource(GeneratedSource):
     ) -> None:
         super().__init__(places)
         self._times, self._columns, self._notify = times, columns, notify
-        # the last row is worth as long as the one before it
+        # The last row is valid for as long as the one before it.
         self._end = times[-1] + (times[-1] - times[-2] if len(times) > 1 else 0.0)
         self._told = False
 

@@ -42,7 +42,7 @@ def load(path: Path, node_id: int = 1) -> tuple[bytes, ObjectDictionary]:
         import canopen
     except ImportError as error:
         raise NotFoundError("An EDS file needs the package canopen.", hint=how_to_install("bench")) from error
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # its lines are our reasons
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # its log lines repeat the reasons in our errors
     try:
         objects = canopen.import_od(str(path), node_id=node_id)
     except Exception as error:  # the parser raises configparser's errors, ValueError, KeyError and its own
@@ -145,5 +145,5 @@ def _default(objects: ObjectDictionary, index: int, subindex: int) -> int:
     variable = objects.get_variable(index, subindex)
     value = variable.default if variable is not None else None
     if variable is not None and isinstance(getattr(variable, "value", None), int):
-        value = variable.value  # a DCF states what the device is configured with
+        value = variable.value  # a DCF also has the configured value
     return value if isinstance(value, int) else 0

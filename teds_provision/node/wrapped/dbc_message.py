@@ -139,7 +139,7 @@ def _messages(path: Path, octets: bytes) -> list[Message]:
             hint="Check the file: the end of a text may be missing.",
         )
     try:
-        # another message of the file may overlap itself: the one that is wrapped is checked alone
+        # Not strict: other messages of the file may have overlapping signals; only the wrapped one is checked.
         loaded = database.load_string(text, database_format="dbc", strict=False)
     except Exception as error:  # parsers under cantools raise their own errors, KeyError and ValueError
         reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__

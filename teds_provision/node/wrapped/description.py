@@ -28,7 +28,7 @@ DEFAULT_PERIOD: Final = 0.1
 PERIODS_LATE: Final = 3
 """A value becomes invalid if the next frame is so many periods late."""
 MOST_CHANNELS: Final = 255
-_RESOLUTION: Final = 1e-7  # of a Float32, about
+_RESOLUTION: Final = 1e-7  # about the resolution of a Float32
 _EXACT_BITS: Final = 24
 _MOST_BITS: Final = 64
 _LARGEST: Final = 1e30
@@ -182,7 +182,7 @@ class WrappedChannel:
         if abs(exact) >= _LARGEST or (held := _float32(exact)) == exact or (held > exact) == (outward > 0):
             return limit
         octets = struct.unpack(">i", struct.pack(">f", held))[0]
-        larger = (held > 0) == (outward > 0)  # the next Float32 is one unit in the last place away from or to zero
+        larger = (held > 0) == (outward > 0)  # the next Float32 away from zero or towards it
         (next_one,) = struct.unpack(">f", struct.pack(">i", octets + (1 if larger else -1)))
         return float((next_one - unit.offset) / unit.scale)
 
@@ -197,10 +197,10 @@ class WrappedChannel:
         if self.is_float:
             plain = self.bits == 32 and (self.scale, self.offset) == (1.0, 0.0) and self._is_si
             return SampleChoice("float32", 4, 32, raw=False) if plain else SampleChoice("float64", 8, 64, raw=False)
-        octets = min(self.bits // 8 + 1, 8)  # a bit to spare marks a sample that has no value
+        octets = min(self.bits // 8 + 1, 8)  # a spare bit marks a sample without a value
         shift = -self.raw_ends[0]
         if not shift and (self.scale, self.offset) == (1.0, 0.0) and self.unit == "count":
-            return SampleChoice("unsigned", octets, self.bits, raw=True)  # a count is its own value
+            return SampleChoice("unsigned", octets, self.bits, raw=True)  # a count needs no conversion
         coefficients = (self.offset - self.scale * shift, self.scale)
         if self.bits <= _EXACT_BITS and self._held_by_float32(coefficients):
             return SampleChoice("unsigned", octets, self.bits, raw=True, shift=shift, coefficients=coefficients)

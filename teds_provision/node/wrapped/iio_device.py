@@ -163,7 +163,7 @@ def _channels(folder: Path) -> Iterator[IioChannel]:
         if match is None:
             continue
         name = file.name.removeprefix("in_").removesuffix(f"_{match['form']}")
-        if name in seen:  # a channel with both has its raw number and its value; input comes first
+        if name in seen:  # a channel that has both files, in_*_input and in_*_raw: input sorts first
             continue
         seen.add(name)
         processed = match["form"] == "input"

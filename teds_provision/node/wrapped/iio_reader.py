@@ -159,7 +159,7 @@ class IioReader:
             except OSError as error:
                 self._trouble(f"the buffer cannot be read: {error.strerror}")
                 return
-            if not octets:  # nothing is behind it any more
+            if not octets:  # end of the buffer
                 self._trouble("the buffer has ended")
                 self._stop.wait(_WAIT)
                 continue

@@ -22,7 +22,8 @@ def extend(command: click.Command) -> None:
 
     @pass_app
     def demo(app: App, /, *, plant: bool, line: bool, **rest: Any) -> None:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: all that was started is to be taken away
+        # as for Ctrl-C: the demo must remove its files and end its processes
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         if rest["page"] + plant + line > 1:
             raise UsageError("Give one of --page, --plant and --line.")
         if plant and rest["http"] is None:

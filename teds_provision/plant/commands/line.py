@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from teds_provision.protocol.plant import job as jobs
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.plant.line import EvidenceRow
-else:  # `evidence verify` reads neither jobs nor requests
+else:  # `evidence verify` needs neither jobs nor requests
     document, jobs = late("teds_provision.protocol.plant.document"), late("teds_provision.protocol.plant.job")
     signing = late("teds_provision.protocol.plant.signing")
 
@@ -109,7 +109,7 @@ def new(app: App, /, output: Path | None, dry_run: bool, **settings: Any) -> Non
     if not roster.has(station.identity.fingerprint, "keeper"):
         raise PolicyError("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, settings)
-    if dry_run:  # an invalid job is refused in a plan too
+    if dry_run:  # sealing checks the job, in a plan too
         jobs.seal_job(drafted, SoftwareKey.generate())
     else:
         station.unlock()
@@ -128,7 +128,7 @@ def _drafted(station: Station, roster: Roster, settings: dict[str, Any]) -> jobs
     path = teds.profile.load.find_profile(settings["profile"], teds.profile.load.default_folders(station.home))
     teds.profile.load.load_profile(path, teds.profile.load.default_folders(station.home)).build(
         bytes(10)
-    )  # else no station could work on the job
+    )  # fails here if no station could build the profile
     boards = _boards(settings["listed"]) if settings["listed"] is not None else {}
     total = settings["count"] or len(boards)
     sign = settings["sign"]

@@ -37,7 +37,7 @@ def extend_export(command: click.Command) -> None:
     core = callback_of(command)
 
     def export_keys(*, send: bool, **rest: Any) -> None:
-        if rest["everything"] != bool(rest["uuids"]):  # the core asks for the nodes first
+        if rest["everything"] != bool(rest["uuids"]):  # otherwise the core command reports that nodes are missing
             if send == (rest["output"] is not None):
                 raise click.UsageError("Give one of --output FILE and --send.")
             if send and len(rest["receivers"]) != 1:

@@ -53,7 +53,7 @@ def registry() -> None:
     """
 
 
-# -- the roster: by who has the CA key ---------------------------------------------------------------------------------
+# -- the roster: commands of the station with the CA key ---------------------------------------------------------------
 
 
 def _change_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -98,13 +98,15 @@ def _emit_change(
     station.unlock()
     with station.lock("registry", app.note):
         held = station.plant.roster
-        if held is None or draft.previous != held.hash:  # two rosters of one version would be an alarm everywhere
+        # two rosters of one version would raise an alarm at all stations
+        if held is None or draft.previous != held.hash:
             raise PolicyError("Another command changed the roster in the meantime.", hint="Run this again.")
         signed = plant.owner.signed(station, draft)
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
         plant.apply_pages.put_roster(station, signed)
-    plant.removed_members.review(station, signed, plant.status.moment(signed))  # marks the keys that a removed one had
+    # flags the keys that a removed station had
+    plant.removed_members.review(station, signed, plant.status.moment(signed))
     app.emit(
         _to_json(signed), f"Roster {signed.version} is in force here. To tell the others: teds-provision registry sync"
     )
@@ -362,7 +364,7 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     )
 
 
-# -- belonging ---------------------------------------------------------------------------------------------------------
+# -- joining and leaving -----------------------------------------------------------------------------------------------
 
 
 @command(
@@ -533,7 +535,7 @@ def _alarm_line(station: Station, alarm: Any) -> str:
     return f"{alarm.code}{f' of {name}' if name else ''}{f', {alarm.n}' if alarm.n else ''}: {alarm.why}"
 
 
-# -- looking -----------------------------------------------------------------------------------------------------------
+# -- status and overviews ----------------------------------------------------------------------------------------------
 
 
 @command("teds-provision registry status", name="status")
@@ -666,12 +668,12 @@ def _members(event: dict[str, Any]) -> str:
 
 
 def _short(value: object) -> str:
-    if isinstance(value, list):  # firmware: its text and version, without the digest of its image
+    if isinstance(value, list):  # of firmware, show text and version, but not the digest of the image
         return " ".join(map(str, value[:2]))
     return str(value)[:20]
 
 
-# -- a person's word ---------------------------------------------------------------------------------------------------
+# -- decisions of the operator -----------------------------------------------------------------------------------------
 
 
 @command("teds-provision registry vouch --all", name="vouch")

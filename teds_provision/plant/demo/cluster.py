@@ -132,7 +132,7 @@ class Cluster:
                 stdout=log,
                 stderr=log,
                 cwd="/",
-                start_new_session=True,  # Ctrl-C is for who started the demo
+                start_new_session=True,  # Ctrl-C is for the process that started the demo
                 user=runs_as() if os.geteuid() == 0 else None,
             )
         end = time.monotonic() + _START

@@ -43,8 +43,8 @@ from teds_provision.protocol.handover.strict_json import (
 from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point, station_key_message, verify
 from teds_provision.protocol.wire_agreement import key_id
 
-# Times are RFC 3339 text in UTC, UUIDs and fingerprints hex in either case (written in lower case). The payload may
-# hold more members than the profile lists; they are skipped. One of ours is ``revoked``, see revocation.py.
+# Times are RFC 3339 text in UTC; UUIDs and fingerprints are hex in either case (written in lower case). The payload may
+# have more members than the profile lists; unknown ones are skipped. This program adds ``revoked``, see revocation.py.
 
 FORMAT = "teds-handover/1"
 
@@ -176,8 +176,8 @@ class _NodeWriter:
             coded_labels = _text(node.profile), ",".join(map(_quoted, node.groups))
             self._labels[node.profile, node.groups] = coded_labels
         profile, groups = coded_labels
-        # x, y and K coded at once, each filled up with zeros to whole groups of three octets: zeros are its spare bits
-        # too
+        # Encode x, y and K together, each padded with zeros to whole groups of three octets, so that their spare bits
+        # are zero.
         key = node.node_key
         coded = encode_base64url(key[1:33] + b"\0" + key[33:] + b"\0" + node.key + b"\0\0")
         return (

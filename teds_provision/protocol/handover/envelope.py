@@ -41,7 +41,7 @@ from teds_provision.protocol.primitives import exceptions
 
 PIECE = 64 * 1024
 _LONGEST_EDGE = 16384  # characters of a JWS header or signature
-_ESCAPE = 5  # characters that an escape (backslash, u, four digits) leaves at most when it is cut
+_ESCAPE = 5  # most characters of an escape (backslash, u, four digits) that remain if it is cut
 _ALPHABET = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 
 Source = bytes | BinaryIO
@@ -167,7 +167,7 @@ def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:
         outline.feed(piece)
     document, first, last = parse_document(bytes(outline.text)), outline.first, outline.last
     before, found, after = _cut(document.pop("ciphertext", None), outline.mark.decode())
-    if last and not found:  # the run is another member's: then all of it is read
+    if last and not found:  # the run belongs to another member: parse the whole text
         file.seek(0)
         document = parse_document(file.read(max_octets))
         before, first, last = document.pop("ciphertext", None), 0, 0

@@ -62,7 +62,7 @@ _IV_OCTETS = 12
 _TAG_OCTETS = 16
 _MAX_HEADER_CHARACTERS = 8192
 _MAX_PARTY_INFO_OCTETS = 256
-# A JWE has about ten members per recipient; a flood of tiny values would cost a hundred times its size to parse.
+# A JWE has about ten members per recipient. Parsing a flood of tiny values would need a hundred times its size.
 MAX_SEPARATORS = 20 * MAX_RECIPIENTS
 
 FindKey = Callable[[str], bytes | None]
@@ -174,7 +174,7 @@ class JweWriter:
 
     def begin(self) -> bytes:
         """Return the octets before the ciphertext."""
-        return self._head[:-1] + b',"ciphertext":"'  # base64url needs no escape
+        return self._head[:-1] + b',"ciphertext":"'  # base64url needs no escapes
 
     def more(self, payload: bytes | memoryview) -> bytes:
         """Return the next characters of the ciphertext."""

@@ -20,17 +20,18 @@ from teds_provision.errors import BadDataError
 from teds_provision.json_decoder import DuplicateNameError, strict_decoder
 
 _TO_URL = bytes.maketrans(b"+/", b"-_")
-# The two characters of plain base64 and the padding become one that no alphabet holds.
+# The two characters that only plain base64 has, and the padding, are mapped to one that no alphabet has.
 _FROM_URL = bytes.maketrans(b"-_+/=", b"+/***")
-_PART = 3 << 16  # a multiple of 3, so that base64 of the parts is that of the whole
+_PART = 3 << 16  # a multiple of 3, so that the base64 of the parts is that of the whole
 _PADDING = (b"", b"===", b"==", b"=")
 _ALPHABET = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
 _TWICE = "an object names a member twice"
 _BYTE_ORDER_MARK = "a byte order mark is no JSON"
 _WINDOW = 64 * 1024
-_NUMBER_GOES_ON = 2  # "1e+" reads as 1, and with a digit more as another number
+_NUMBER_GOES_ON = 2  # "1e+" is read as 1, but one more digit makes another number
 _WHITE = " \t\n\r"
-# The last characters that leave no spare bit set, by how many characters the last group has (1 decodes to nothing).
+# The permitted last characters, whose spare bits are zero, by the number of characters in the last group (1 is
+# invalid).
 _LAST = (frozenset(_ALPHABET), frozenset[int](), frozenset(_ALPHABET[::16]), frozenset(_ALPHABET[::4]))
 
 
@@ -276,12 +277,11 @@ _DECODER = strict_decoder()
 _EXACT = strict_decoder(fractions=False)
 
 
-# Reading the members of a signed payload: each with its type, its range and its own complaint.
+# Reads the members of a signed payload (profile.md, "Handover between base stations"), each with its type, range and
+# error message.
 #
-# The payloads are those of profile.md, "Handover between base stations".
-#
-# Members that are not known are passed over: the signature covers them, and a later format may add some. Members that
-# are known are read strictly. Text for people must be printable, so that a name cannot steer a terminal.
+# Unknown members are skipped: the signature covers them, and a later format may add some. Known members are read
+# strictly. Text for users must be printable, so that a name cannot control a terminal.
 
 LAST_U32 = 0xFFFFFFFF
 _MAX_TEXT = 1024

@@ -222,7 +222,7 @@ def _reply(octets: bytes, request: Message | None) -> Message:
         findings.append(Finding("note", "reply-guessed", text, REPLY_HEADER))
     tagged = read_tagged(payload, layout, REPLY_HEADER) if request is not None and request.school == "tagged" else None
     arguments, more = (tagged, []) if tagged is not None else read_plain(payload, layout, REPLY_HEADER)
-    asked = request or Message(b"", "unknown", 2007, "")  # of which nothing is known
+    asked = request or Message(b"", "unknown", 2007, "")  # an unknown request
     return Message(
         octets,
         "reply",
@@ -254,7 +254,7 @@ def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[st
         return "reason:u8", "Refusal", request is None
     if request is not None and request.group is not None and request.function is not None:
         spec = COMMANDS.get((request.group, request.function), Spec(request.name, reply="octets:octets"))
-        # A failure carries a reply of that form, or nothing.
+        # A failure has a payload of the reply's form, or none.
         form = spec.reply if spec.answer is None or request.arguments else spec.answer
         layout = (form or "") if ok or len(payload) in {4, 12} else "octets:octets"
         return layout, f"Reply to {spec.name}" if ok else f"Failure of {spec.name}", False

@@ -328,7 +328,7 @@ NETWORK: Final[dict[tuple[int, int], Spec]] = {
 }
 
 
-# In words, for people who look at what goes over a link: names, numbers and sizes, no content.
+# Descriptions for users who look at the traffic of a link: names, numbers and sizes, no content.
 
 _NUMBERS: Final = {kind: frozenset(map(int, kind)) for kind in (Function, TedsFunction)}
 

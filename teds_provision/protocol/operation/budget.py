@@ -33,7 +33,7 @@ def classic_bits(octets: int, *, worst: bool = True) -> int:
 
     ISO 11898-1. ``worst``: with the most stuff bits that can be; else without any.
     """
-    stuffed = 54 + 8 * octets  # start, identifier, control, data, CRC: the part that is stuffed
+    stuffed = 54 + 8 * octets  # start, identifier, control, data, CRC: the part with stuff bits
     return stuffed + (stuffed - 1) // 4 * worst + 13
 
 

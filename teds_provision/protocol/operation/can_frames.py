@@ -131,7 +131,7 @@ class StreamAssembly:
                 self.broken += 1
             self._held = bytearray()
         elif self._held is None or segment != self._next:
-            # what was begun, or what this frame belongs to, is lost; counted once until the next segment 0
+            # A segment is missing, so the message is lost; it counts once until the next segment 0.
             if self._held is not None:
                 self.broken += 1
                 self._held = None

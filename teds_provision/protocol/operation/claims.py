@@ -40,7 +40,7 @@ class Claims:
             if facts.actuator:
                 self._go_safe(channel)
 
-    # -- questions -------------------------------------------------------------------------------------------------
+    # -- queries ---------------------------------------------------------------------------------------------------
 
     def channels_of(self, session: NodeSession) -> frozenset[int]:
         """Return the channels that a session claims."""
@@ -62,7 +62,7 @@ class Claims:
         """Return the sessions that claim something."""
         return {held.session for held in self.actuators.values()}.union(*self._sensors.values())
 
-    # -- claiming and letting go -----------------------------------------------------------------------------------
+    # -- claim and release -----------------------------------------------------------------------------------------
 
     def claim_sensors(self, session: NodeSession, channels: Iterable[int], lease: int) -> None:
         """Claim sensors for ``lease`` s; several sessions may."""

@@ -105,7 +105,7 @@ class OperationRole:
             (SECURITY_CLASS, Function.DRIVE): lambda inner: self.streams.drive(_payload(inner), *inner[1:3]),
         }
 
-    # -- what Tim asks ---------------------------------------------------------------------------------------------
+    # -- called by Tim ---------------------------------------------------------------------------------------------
 
     def now(self) -> int:
         """Return the present tick."""
@@ -117,7 +117,7 @@ class OperationRole:
 
     def run(self, inner: InnerCommand) -> Reply:
         """Run one inner command that it knows; raises CommandRefusedError."""
-        self.poll()  # what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop
+        self.poll()  # first end expired leases and dead-men, and take samples that are due, for example before a Stop
         self._ports[inner.session] = inner.port
         return Reply(True, self._commands[inner.command.command_class, inner.command.function](inner))
 
@@ -137,7 +137,7 @@ class OperationRole:
         self.streams.session_ended(session)
         self._ports.pop(session, None)
 
-    # -- events and questions of links -----------------------------------------------------------------------------
+    # -- events, and queries of links ------------------------------------------------------------------------------
 
     def poll(self) -> float | None:
         """Take what is due; return seconds until a sample, lease or dead-man is due again, None if none is known.
@@ -179,7 +179,7 @@ class OperationRole:
         demand(FIRST_LEASE <= asked.lease <= LAST_LEASE, Reason.OUT_OF_RANGE)
         if asked.dead_man is not None:
             demand(FIRST_DEAD_MAN <= asked.dead_man <= LAST_DEAD_MAN, Reason.OUT_OF_RANGE)
-        # an actuator is claimed once: by this session already (13), or by another (17)
+        # An actuator has one claim: refuse with 13 if it is this session's, with 17 if it is another one's.
         held = self.claims.actuators.get(number)
         if held is not None:
             raise CommandRefusedError(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
@@ -295,7 +295,7 @@ class OperationRole:
         demand_form(not inner.command.payload)
         return self._hardware.power().encode()
 
-    # -- the inside ------------------------------------------------------------------------------------------------
+    # -- internals -------------------------------------------------------------------------------------------------
 
     def _addressed(self, inner: InnerCommand) -> tuple[int, ChannelHardware]:
         facts = self._hardware.channels.get(inner.command.channel)

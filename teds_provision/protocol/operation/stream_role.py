@@ -200,7 +200,7 @@ class StreamRole:
             armed[Action(asked.action)] = ArmedTrigger(asked.commitment, self._real() + asked.life * SECOND)
         return b""
 
-    # -- what comes without a reply --------------------------------------------------------------------------------
+    # -- triggers and events ---------------------------------------------------------------------------------------
 
     def trigger(self, session: NodeSession, token: bytes, tick: int) -> None:
         """Handle a trigger frame of this session's station; the clock was at ``tick`` at the frame's end."""
@@ -296,7 +296,7 @@ class StreamRole:
         for stream in list(self._streams):
             stream.sample(self._hardware, now)
             if stream.ended and stream.waiting is None and not self._sender(stream.port.bus).sends(stream):
-                self._end(stream)  # the last counter was sent
+                self._end(stream)  # the message with the last counter was sent
 
     def next_instant(self) -> int | None:
         """Return the tick of the next sample."""
@@ -312,7 +312,7 @@ class StreamRole:
         due = [self._sender(bus).due(self._on(bus)) for bus in {stream.port.bus for stream in self._streams}]
         return min((at for at in due if at is not None), default=None)
 
-    # -- the inside ------------------------------------------------------------------------------------------------
+    # -- internals -------------------------------------------------------------------------------------------------
 
     def _measuring_of(self, session: NodeSession) -> _SessionStreams:
         return self._sessions.setdefault(session, _SessionStreams())

@@ -82,7 +82,8 @@ class Stream:
                 self._patterned += 1
                 self._event(due, octets, valid=True)
             elif self._held == 0 and now - due >= 3 * self.span:
-                self._skip((now - due) // self.span - 1)  # the host slept: those messages are lost, and shown as lost
+                # after a suspend of the host, the missed messages count as lost
+                self._skip((now - due) // self.span - 1)
             else:
                 self._instant(hardware, due)
 

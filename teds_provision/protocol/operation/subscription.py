@@ -130,7 +130,7 @@ class StreamMessage(NamedTuple):
     Sample i of it was taken at ``tick`` + i · period (kinds periodic and free). For events ``index`` counts events.
     """
 
-    # A NamedTuple, since one is made for every message; it hides tuple.index, which no caller needs of a message.
+    # A NamedTuple, for speed: one is made for every message. It hides tuple.index, which no caller needs.
     counter: int
     index: int  # type: ignore[assignment]
     tick: int
@@ -197,10 +197,10 @@ class Receiver:
         self._before = previous._sealer if previous is not None else None
         self._length = plan.length
         self._n, self._period = plan.subscribe.n, plan.subscribe.period
-        # Of its last instant; a message is dated by its first one.
+        # The limit applies to the last instant, and a message has the time of its first one.
         self._oldest = (2 * plan.span + LATE_AFTER if oldest is None else oldest) + plan.span - self._period
         self._timed = plan.subscribe.kind != StreamKind.PERIODIC
-        self._tick = -1  # of the last good message
+        self._tick = -1  # tick of the last good message
         self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
         self._held: deque[tuple[StreamMessage, TickBounds]] = deque()
 
@@ -219,7 +219,7 @@ class Receiver:
         for octets, at in came:
             plain = opened(octets) if len(octets) == length else None
             if plain is None:
-                # another length than was computed, or a tag that is not of this run
+                # Wrong length, or a tag that does not verify under this run's key.
                 if len(octets) != self._length:
                     self.counts.junk += 1
                 elif self._before is None or self._before.open(octets) is None:
@@ -233,7 +233,8 @@ class Receiver:
             if message.flags & TEST_PATTERN != pattern:
                 self.counts.unasked += 1
             elif not dated:
-                # keep a message whose time is not known yet; the oldest goes if there are too many
+                # Hold the message, because the clock or the start is not known yet; if there are too many, drop the
+                # oldest.
                 if len(self._held) == MOST_HELD:
                     self._held.popleft()
                     self.counts.overflow += 1

@@ -119,7 +119,7 @@ def join(header: bytes, content: bytes, signature: bytes) -> bytes:
     return b".".join((header, base64url(content), base64url(signature)))
 
 
-# -- forms of values: lower case, whole numbers, one spelling of everything --------------------------------------------
+# -- forms of values: lower case, whole numbers, one spelling each -----------------------------------------------------
 
 _PATTERNS: Final = {
     "uuid": (re.compile("[0-9a-f]{20}"), "is no UUID of 20 hex digits in lower case"),
@@ -252,7 +252,7 @@ class Fields:
         return BadDataError(f"{self._where}: {name} {complaint}.")
 
 
-# -- a station that wants to be a member -------------------------------------------------------------------------------
+# -- requests to become a member ---------------------------------------------------------------------------------------
 
 _LOGIN: Final = re.compile(r"SCRAM-SHA-256\$4096:[A-Za-z0-9+/]{22,86}={0,2}\$[A-Za-z0-9+/]{43}=:[A-Za-z0-9+/]{43}=")
 

@@ -133,7 +133,8 @@ def read(value: object) -> Event | str | None:
     for name, holds in forms.items():
         if name not in value or not holds(value[name]):
             return f"{act}: {name} is not of its form"
-    if act == "revoked" or len(value) > len(forms) + 3 + (node is not None):  # else its forms bound it
+    # otherwise the forms of its members limit its size
+    if act == "revoked" or len(value) > len(forms) + 3 + (node is not None):
         octets = json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode(errors="surrogatepass")
         if len(octets) > (MOST_OCTETS_OF_REVOKED if act == "revoked" else MOST_OCTETS):
             return f"{act}: larger than an event may be"

@@ -485,7 +485,7 @@ def _require_plain(value: object, depth: int = _DEPTH) -> None:
     for member in value.values() if kind is dict else value:  # type: ignore[attr-defined, union-attr]
         own = type(member)
         if own is not str and member is not None and (own is not int or not 0 <= member <= LAST_U32):
-            _require_plain(member, depth - 1)  # for few of them: each call costs more than the look
+            _require_plain(member, depth - 1)  # only for a few members: a call takes longer than the check
 
 
 def _short(steps: list[Any]) -> list[Any]:
@@ -495,7 +495,7 @@ def _short(steps: list[Any]) -> list[Any]:
 
 
 def _block(value: object) -> tuple[int, int, str]:
-    # Facts hold no true or false here (_require_plain); a match statement takes three times as long.
+    # There are no booleans here (_require_plain), which would pass as int. A match statement takes three times as long.
     if type(value) is list and len(value) == 3:
         channel, code, digest = value
         small = type(channel) is int and type(code) is int and channel <= 0xFFFF and code <= 0xFF
@@ -538,9 +538,9 @@ def _time(members: Members, name: str) -> str:
     if not _TIME.fullmatch(text):
         raise BadDataError(f"The evidence: {name} is not a time like 2026-01-31T12:00:00Z.")
     try:
-        datetime.fromisoformat(text)  # the 31st of February is none either
+        datetime.fromisoformat(text)  # rejects dates such as 31 February
     except ValueError:
-        members.time(name)  # complains of it
+        members.time(name)  # raises the error with the member's name
     return text
 
 
@@ -550,7 +550,7 @@ def _hex(members: Members, name: str, lengths: tuple[int, ...] | None) -> bytes:
         octets = bytes.fromhex(text) if isinstance(text, str) else None
     except ValueError:
         octets = None
-    # fromhex skips spaces and takes capitals, and the one spelling is three times as fast to compare as to match
+    # fromhex also accepts spaces and capitals; comparing with hex() is three times as fast as a pattern.
     if octets is None or octets.hex() != text or (lengths and len(octets) not in lengths):
         raise BadDataError(f"The evidence: {name} is not hex of the right length.")
     if name == "point" and not is_point(octets):
@@ -564,7 +564,7 @@ def base64_of(text: object, name: str) -> bytes:
         octets = binascii.a2b_base64(text, strict_mode=True) if isinstance(text, str) else None
     except ValueError as error:
         raise BadDataError(f"The evidence: {name} is not base64.") from error
-    # Strict reading leaves the end open, its spare bits and padding: that alone is spelled again, not all 4,000 octets.
+    # Strict mode does not check the spare bits and padding at the end: encode only the end again, not all 4,000 octets.
     end = (len(octets) - 1) // 3 if octets else 0
     if octets is None or binascii.b2a_base64(octets[3 * end :], newline=False).decode() != str(text)[4 * end :]:
         raise BadDataError(f"The evidence: {name} is not base64 in its one spelling.")

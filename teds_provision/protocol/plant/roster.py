@@ -271,7 +271,7 @@ def _share(value: object) -> Share:
     raise fields.bad("what", "is none of all, group, profile")
 
 
-# -- which of two rosters holds ----------------------------------------------------------------------------------------
+# -- which of two rosters counts ---------------------------------------------------------------------------------------
 
 Taking = Literal["taken", "taken, two rosters", "same", "older", "two rosters", "refused"]
 

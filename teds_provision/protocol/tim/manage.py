@@ -192,7 +192,7 @@ class ManageFilter:
         try:
             answer = decode_map(decode_packet(reply).body)
         except ValueError:
-            return reply  # the station judges it
+            return reply  # not a map: the station handles it
         if any(key in answer for key in SMP_ERROR_KEYS):
             return reply
         done = answer.get("off") == self._started_octets

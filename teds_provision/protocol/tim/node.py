@@ -137,7 +137,7 @@ class Tim:
             Function.MANAGE: self._manage_packet,
         }
 
-    # -- what links call -------------------------------------------------------------------------------------------
+    # -- called by links -------------------------------------------------------------------------------------------
 
     @property
     def flash(self) -> Flash:
@@ -168,9 +168,10 @@ class Tim:
         now. When the reply has left, call :meth:`reply_sent`.
         """
         tick = received if received is not None else self._role.now() if self._role is not None else 0
-        self.poll()  # what ran out before this frame is over, and is reported: it revives no lease, hides no dead-man
+        # first end what expired before this frame, so that it cannot renew an expired lease or hide a dead-man
+        self.poll()
         reply = self._run(frame, Origin(link, tapped, port or port_of(link), tick)).encode()
-        while self._ending:  # what ends with the reply: sessions after Close, Confirm, Reset
+        while self._ending:  # sessions that end after the reply to Close, Confirm or Reset
             self._ending.pop()()
         return reply
 
@@ -184,7 +185,7 @@ class Tim:
         self._commit(in_factory_state(self._flash), safe=True)
         self._end_everything()
 
-    # -- what links that measure call as well ----------------------------------------------------------------------
+    # -- also called by links that carry data ----------------------------------------------------------------------
 
     def reply_sent(self, link: str) -> None:
         """Handle that the reply to the last command of this link has left: its session's streams may follow."""
@@ -297,7 +298,7 @@ class Tim:
             raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
         return self._role.run(InnerCommand(command, origin.session, origin.port, origin.received))
 
-    # -- class 128: each gives the payload of its reply ------------------------------------------------------------
+    # -- class 128: each method returns the payload of its reply ---------------------------------------------------
 
     def _request(self, payload: bytes, origin: Origin) -> bytes:
         return self._agreeing.request(payload, origin, self._flash)
@@ -382,7 +383,7 @@ class Tim:
         self._sessions.end_all()
         self._agreeing.forget()
 
-    # -- the rest --------------------------------------------------------------------------------------------------
+    # -- other commands --------------------------------------------------------------------------------------------
 
     def _common(self, command: Command, origin: Origin) -> Reply:
         flash, teds, session = self._flash, self._teds, origin.session
@@ -435,7 +436,7 @@ class Tim:
             self._role.claims.everything_safe()
         self.memory.commit(state)
         if self.memory.load() != state:
-            raise FlashError  # it took something else: what is not there does not count
+            raise FlashError  # the memory stored something else: keep the present state
         self._flash = state
 
 

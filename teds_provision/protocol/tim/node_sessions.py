@@ -66,7 +66,7 @@ class Sessions:
         ended: Callable[[NodeSession], None],
     ) -> None:
         self._clock, self._one_time, self._room, self._claims, self._ended = clock, one_time, room, claims, ended
-        # c of Open: random at the start, so that no mac from before a restart is good again
+        # c of Open is random at the start, so that no mac from before a restart is accepted.
         self._opens = int.from_bytes(random(COUNTER_OCTETS), "big")
         self._links: dict[str, _LinkSessions] = {}
 
@@ -80,7 +80,8 @@ class Sessions:
         key, station = flash.key, payload[KEY_ID_OCTETS:-TAG_OCTETS]
         if key is None or not hmac.compare_digest(payload[:KEY_ID_OCTETS], key_id(key)):
             raise CommandRefusedError(Reason.UNKNOWN_KEY)
-        # The mac before the point: a stranger costs no point arithmetic, and each Open is good once.
+        # Check the mac before the point: a station without the key causes no point arithmetic, and each Open works only
+        # once.
         if not hmac.compare_digest(payload[-TAG_OCTETS:], open_mac(key, flash.uuid, counter, station)):
             raise CommandRefusedError(Reason.BAD_TAG)
         self._opens = (self._opens + 1) % (1 << 8 * COUNTER_OCTETS)
@@ -153,7 +154,7 @@ class Sessions:
         for held in links.values():
             self._end(held)
 
-    # -- the inside ------------------------------------------------------------------------------------------------
+    # -- internals -------------------------------------------------------------------------------------------------
 
     def _end(self, held: _LinkSessions) -> None:
         session, held.session = held.session, None

@@ -85,7 +85,7 @@ class Permission:
     def check(self, command: Command, origin: Origin) -> None:
         """Raise CommandRefusedError if the command may not be run now, or is not known."""
         if command.command_class == SECURITY_CLASS:
-            # class 128 goes to channel 0; an unknown function gets 1 in every state
+            # Class 128 must be addressed to channel 0; an unknown function gets 1 in every state.
             unknown = (
                 command.function not in _FUNCTIONS
                 or (command.function == Function.SET_CAN_ADDRESS and not self.has_can)
@@ -96,13 +96,13 @@ class Permission:
             if origin.session is None:
                 self._plain_security(Function(command.function), command.payload, origin)
             else:
-                # inside a session a node answers 1 to what it does not measure
+                # In a session, 1 for commands of operation.md that this node does not implement.
                 if command.function in _PLAIN_ALONE:
                     raise CommandRefusedError(Reason.NOT_PERMITTED)
                 if command.function in _MEASURING and not self._measures(command):
                     raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
         elif origin.session is None:
-            # Other classes outside a session: Query and Read alone
+            # Other classes outside a session: only Query and Read.
             if not of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
                 raise CommandRefusedError(Reason.NOT_PERMITTED)
             if command.function == TedsFunction.READ:
@@ -132,7 +132,8 @@ class Permission:
         if function in _IN_FACTORY and not self.in_factory():
             raise CommandRefusedError(Reason.NOT_PERMITTED)
         if function == Function.ABOUT and origin.port.kind != "can" and not self.in_factory():
-            raise CommandRefusedError(Reason.NOT_PERMITTED)  # no stranger in radio range learns what runs on a robot
+            # a stranger in radio range must not learn which firmware a robot runs
+            raise CommandRefusedError(Reason.NOT_PERMITTED)
 
     def _measures(self, command: Command) -> bool:
         return self.role is not None and self.role.knows(command)

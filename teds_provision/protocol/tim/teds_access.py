@@ -166,7 +166,7 @@ def _block(command: Command, octets: int) -> BlockId:
     return block
 
 
-# The commit: what Update of TEDS 128 verifies before anything is stored, in order (profile.md, "Writing to flash").
+# The commit: the checks of Update of TEDS 128 before anything is stored, in order (profile.md, "Writing to flash").
 
 
 def _demand(holds: bool, reason: Reason) -> None:

@@ -171,7 +171,7 @@ class Line:
                 return
             after = (rows[-1].uuid, rows[-1].attempt, rows[-1].sha256)
 
-    # -- what an office was asked ----------------------------------------------------------------------------------
+    # -- requests to an office -------------------------------------------------------------------------------------
 
     def sign_request(self, hash: str, direction: Literal["out", "in"]) -> SignRequestRow | None:
         """Return a request by its H, None if it has the other direction or does not exist."""

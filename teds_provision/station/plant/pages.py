@@ -15,7 +15,7 @@ from teds_provision.station.store.database import places
 from teds_provision.station.store.records import utc_now
 from teds_provision.station.store.store import Store
 
-_LEVEL: Final = 3  # zlib: a page of 500 kB in 5 ms, to a fifth of its octets
+_LEVEL: Final = 3  # zlib: compresses a page of 500 kB in 5 ms to a fifth
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ class Parcels:
         )
         return [(uuid, epoch, set(receivers.split(","))) for uuid, epoch, receivers in rows]
 
-    # -- what a removed station has had ------------------------------------------------------------------------------
+    # -- what a removed station received -----------------------------------------------------------------------------
 
     def review(self) -> str | None:
         """Return what was found when the keys were looked through last, JSON."""

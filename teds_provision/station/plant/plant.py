@@ -33,7 +33,7 @@ from teds_provision.vault.base import Vault
 if TYPE_CHECKING:
     from teds_provision.protocol.plant import claim, document, event, roster, signer
     from teds_provision.protocol.plant.roster import Role
-else:  # cryptography: not for commands that only list
+else:  # imports cryptography, which commands that only list do not need
     event = late("teds_provision.protocol.plant.event")
     claim, document = late("teds_provision.protocol.plant.claim"), late("teds_provision.protocol.plant.document")
     roster, signer = late("teds_provision.protocol.plant.roster"), late("teds_provision.protocol.plant.signer")
@@ -75,7 +75,7 @@ class RosterRow:
 
 
 _PLANT = ", ".join(column.name for column in fields(PlantRecord))
-_DIGEST_OCTETS: Final = 32  # a TEDS is longer
+_DIGEST_OCTETS: Final = 32  # a TEDS is longer than a digest
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ class Plant:
                 signer.missing_pages(f"the keeper {held.name_of(about)}", held.name_of(who), n, counted.get(about, 0))
                 for who, about, n, _ in self.pages.heads()
                 if n > counted.get(about, 0)
-                and about != self._identity.fingerprint  # a keeper knows its own chain
+                and about != self._identity.fingerprint  # a keeper always has its own chain
                 and held.member(who) is not None
                 and bool(held.roles_of(who) - {"audit"})
                 and "keeper" in held.roles_of(about)
@@ -302,7 +302,7 @@ class Plant:
         text = json.dumps(members, ensure_ascii=False, separators=(",", ":"))
         with self._store.together():
             self._store.execute("INSERT INTO outbox(id, event) VALUES(?, ?)", (members["id"], text))
-            if uuid is not None:  # its node is judged again at the next fold
+            if uuid is not None:  # the merged claims of its node are computed again at the next fold
                 self.claims.queue([bytes.fromhex(uuid)])
 
     def outbox(self, most: int) -> list[tuple[int, str, str]]:
@@ -358,7 +358,7 @@ class Plant:
     def _context(self) -> bytes:
         return b"TEDS1 registry login\0" + self._store.id.encode()
 
-    # -- what the last sync found in the database --------------------------------------------------------------------
+    # -- what the last sync found in the registry's database ---------------------------------------------------------
 
     def returned_state(self) -> str:
         """Return the digest of what the database and this store had of stations that left, at the last comparison."""
@@ -388,7 +388,7 @@ class Plant:
         if self.doors() != list(doors):
             self._store.execute("INSERT OR REPLACE INTO meta VALUES('plant-doors', ?)", (json.dumps(list(doors)),))
 
-    # -- which home this is, and one that came back from a backup --------------------------------------------------
+    # -- the id of this home, and a home restored from a backup ----------------------------------------------------
 
     @property
     def home(self) -> str:

@@ -129,7 +129,7 @@ class AuditLog:
         with self._database.together(), self._database.logging():
             last = self._database.first_row(_END)
             count, previous, noted = last or (0, self._root, self._noted())
-            if self._read(noted) != (count, previous):  # goes on, but the loss is never forgotten
+            if self._read(noted) != (count, previous):  # entries are missing: continue, but record the loss permanently
                 self._database.execute("INSERT OR IGNORE INTO meta VALUES('audit-lost', ?)", (str(count + 1),))
             row = (count + 1, utc_now(), ACTOR.get() or _who(), act, uuid, outcome, text)
             head = _chained(previous, row)
@@ -324,6 +324,7 @@ def _who() -> str:
     """Return the user and the host of this process; neither changes while it runs."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError, ImportError):  # no entry in the user database, as in a container, or no such database
+    # the user has no entry in the user database, as in a container, or the system has none
+    except (KeyError, OSError, ImportError):
         user = f"uid {os.getuid()}" if HAS_OWNERS else "unknown"
     return f"{user}@{name_of_machine()}"

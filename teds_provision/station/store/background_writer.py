@@ -34,7 +34,7 @@ class BackgroundWriter:
             self._thread = threading.Thread(target=self._work, name="durable steps", daemon=True)
             self._thread.start()
         self._waiting[self._owner] = self
-        context = copy_context()  # its actor is in the audit log
+        context = copy_context()  # keeps the actor for the audit log
         self._steps.put(lambda: context.run(step))
 
     def wait(self) -> None:

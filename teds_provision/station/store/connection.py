@@ -22,7 +22,7 @@ from teds_provision.station.store.background_writer import BackgroundWriter
 from teds_provision.station.store.schema import SCHEMA_VERSION
 from teds_provision.station.store.sqlite import sqlite3
 
-# Errors of SQLite and the system when the store's file fails, as messages of the tool: cause and remedy.
+# Translates errors of SQLite and of the system into messages with cause and remedy.
 
 BUSY_SECONDS = 10.0
 _RESTORE = "Restore a backup (teds-provision restore), or move the file away and run teds-provision init."
@@ -32,7 +32,7 @@ _READ_ONLY = (
     "it cannot be written",
     "Check the owner and mode of the home directory and whether the disk is read-only.",
 )
-# SQLite's primary result codes; written out, so that sqlite3 is not loaded for --help (sqlite.org, rescode).
+# SQLite's primary result codes (sqlite.org, rescode); written out, so that --help need not load sqlite3.
 _SQLITE_FULL, _SQLITE_READONLY, _SQLITE_PERM, _SQLITE_CANTOPEN = 13, 8, 3, 14
 _SQLITE_IOERR, _SQLITE_CORRUPT, _SQLITE_NOTADB, _SQLITE_CONSTRAINT = 10, 11, 26, 19
 _CAUSES: dict[int, tuple[str, str]] = {
@@ -138,7 +138,7 @@ class Connection:
         if self.background:
             self.drain()
         with self._lock:
-            try:  # not by _run(): every step makes dozens of statements
+            try:  # without _run(), because each step executes dozens of statements
                 return self._connection.execute(statement, values).fetchall()
             except (sqlite3.Error, OSError, UnicodeError) as error:
                 if not self._is_to_wait(error):
@@ -227,7 +227,7 @@ class Connection:
         """
         with self._lock:
             held = self._depth or self._reader == threading.get_ident()
-            if self._steady is None or not held:  # no other one changes it while this one does
+            if self._steady is None or not held:  # within our own transaction, no other connection can change it
                 self._steady = self.version()
             return self._steady, self._taken_back
 
@@ -277,7 +277,7 @@ class Connection:
             try:
                 log = os.open(self.path.with_name(self.path.name + "-wal"), os.O_RDWR | NOFOLLOW | CLOSING)
                 try:
-                    sync_content(log)  # of any descriptor: all that was written to the file
+                    sync_content(log)  # fsync on any descriptor writes the whole file
                 finally:
                     os.close(log)
             except OSError as error:
@@ -305,12 +305,12 @@ class Connection:
             raise
 
     def _begin(self, later: bool) -> None:
-        if later:  # written to the log in its order, and not waited for
+        if later:  # commits are written in order, but without waiting for the disk
             self.execute("PRAGMA synchronous=NORMAL")
         try:
             self.execute("BEGIN IMMEDIATE")
             self.require_known_schema()
-        except BaseException:  # also if it was interrupted between BEGIN and the block that would roll it back
+        except BaseException:  # also after an interrupt between BEGIN and the caller's block
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
@@ -346,7 +346,7 @@ class Connection:
             raise StoreError("Part of this change failed, so all of it was undone.", hint="Run it again.")
         if block.level == 0:
             self.execute("COMMIT")
-            if self._added and not block.later:  # the log, and all that was written to it before, is on the disk
+            if self._added and not block.later:  # this fsync also covers earlier commits in the log
                 self._settled = self.commits_not_waited_for
         elif block.apart:
             self.execute(f"RELEASE s{block.level}")
@@ -359,7 +359,7 @@ class Connection:
             return
         name = f"s{block.level}"
         for statement in (f"ROLLBACK TO {name}", f"RELEASE {name}") if block.level else ("ROLLBACK",):
-            with suppress(sqlite3.Error):  # SQLite may have rolled back by itself (disk full)
+            with suppress(sqlite3.Error):  # SQLite may have rolled back already (disk full)
                 self._connection.execute(statement)
         self._spoilt = block.spoilt
 
@@ -375,16 +375,17 @@ class Connection:
 
     def _failure(self, error: Exception) -> TedsProvisionError:
         """Return the error to raise in place of one of SQLite, of the system, or of a text."""
-        if isinstance(error, UnicodeDecodeError):  # SQLite quotes what it found in a damaged file
+        if isinstance(error, UnicodeDecodeError):  # SQLite's message contains octets of a damaged file
             return self._damaged()
         if isinstance(error, sqlite3.Error | OSError):
             if self._frozen is not None and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY:
                 return self._frozen
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_ERROR:  # a column that is not there
+            # perhaps an unknown column, as in another schema
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_ERROR:
                 with suppress(sqlite3.Error):
                     self.require_known_schema()
             return as_store_failure(error, self.path)
-        return BadDataError("A name or text is not valid UTF-8.", hint="Give it in UTF-8.")  # from a command line
+        return BadDataError("A name or text is not valid UTF-8.", hint="Give it in UTF-8.")  # from the command line
 
 
 class Transaction:

@@ -32,7 +32,7 @@ from teds_provision.station.store.connection import (
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 from teds_provision.station.store.sqlite import FILE_NAME, sqlite3
 
-# Before SQLite opens anything in the home of a station: its owner, its permissions, and its content.
+# Checks of a home's files before SQLite opens them: owner, permissions, and content.
 
 
 def prepare_home(home: Path, *, create: bool) -> None:
@@ -41,7 +41,7 @@ def prepare_home(home: Path, *, create: bool) -> None:
         home.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
             home.mkdir(mode=0o700)
-            home.chmod(0o700)  # whatever the umask was
+            home.chmod(0o700)  # mkdir's mode is reduced by the umask
     try:
         status = home.stat()
     except FileNotFoundError:
@@ -67,7 +67,7 @@ def prepare_file(path: Path, *, create: bool) -> None:
     if not path.exists():
         raise StoreError(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
     if is_open_to(0o077, path.stat()):
-        with suppress(OSError):  # a disk that is read-only: what is read stays as open as it was
+        with suppress(OSError):  # on a read-only disk the mode cannot be changed
             path.chmod(0o600)
 
 
@@ -219,7 +219,7 @@ class Database(Connection):
             wanted = set(uuids)
             statement = f"{selection} WHERE uuid BETWEEN ? AND ? ORDER BY uuid LIMIT ?"
             rows = self.execute(statement, (min(wanted), max(wanted), most))
-            if len(rows) < most:  # else there are others between them
+            if len(rows) < most:  # otherwise the limit was reached: the range has many other nodes
                 try:
                     return [make(*row) for row in rows if row[0] in wanted]
                 except (ValueError, TypeError, AttributeError) as error:
@@ -265,7 +265,7 @@ class Database(Connection):
     def _bring_forward(self) -> None:
         """Make the tables of the present schema out of what is there, or out of nothing, all or none of them."""
         with self.transaction(), self._translated():
-            before = self._version()  # another process may have been first
+            before = self._version()  # another process may have done it meanwhile
             for statement in statements(before):
                 self.execute(statement)
             self.execute(f"PRAGMA application_id={APPLICATION_ID}")
@@ -296,10 +296,10 @@ class Database(Connection):
         return int(version)
 
 
-# A disk that is full or read-only must not hide what is known. SQLite needs a writable folder for the shared memory of
-# a write-ahead log, and without the log the newest entries would be missing. So both files are copied to where there is
-# room (memory first), brought together there, and opened without a name: nothing of the copy is left when the process
-# ends, however it ends.
+# A full or read-only disk must not prevent reading the store. SQLite needs a writable folder for the shared memory of a
+# write-ahead log, and without the log the newest entries would be missing. So both files are copied to a place with
+# room (memory first), merged there, and then unlinked while open: nothing of the copy is left when the process ends,
+# even after a kill.
 
 _LOG = "-wal"
 
@@ -339,8 +339,8 @@ def _copied(path: Path, folder: Path) -> sqlite3.Connection:
         shutil.copyfile(log, copy.with_name(copy.name + _LOG))
     connection = sqlite3.connect(copy, isolation_level=None, check_same_thread=False)
     try:
-        connection.execute("PRAGMA locking_mode=EXCLUSIVE")  # no shared memory, so no third file
-        connection.execute("PRAGMA journal_mode=MEMORY")  # takes what stood in the log into the file
+        connection.execute("PRAGMA locking_mode=EXCLUSIVE")  # avoids the shared memory, which would be a third file
+        connection.execute("PRAGMA journal_mode=MEMORY")  # moves the log's contents into the file
         connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
     except BaseException:
         connection.close()

@@ -49,7 +49,7 @@ def dump(store: Store) -> Iterator[bytes]:
     """
     with store._lock, store._translated():
         connection = store._connection
-        connection.execute("BEGIN")  # the first SELECT takes the moment, and blocks no other process
+        connection.execute("BEGIN")  # the snapshot begins with the first SELECT and does not block other processes
         try:
             version = int(connection.execute("PRAGMA user_version").fetchone()[0])
             tables = _tables(connection)
@@ -107,7 +107,7 @@ def _fill(connection: sqlite3.Connection, source: RowSource) -> None:
         if known.get(table) != columns:
             raise BadDataError(f"The store in the backup has an unknown table {table}.")
     for table in known:
-        connection.execute(f"DELETE FROM {table}")  # what a schema begins with; the dump brings it as it became
+        connection.execute(f"DELETE FROM {table}")  # rows that the schema creates are replaced by the dump's
     inserts = [f"INSERT INTO {table} VALUES({places(columns)})" for table, columns in tables.items()]
     widths = [len(columns) for columns in tables.values()]
     for number, chunk in _chunks(source, widths):

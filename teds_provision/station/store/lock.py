@@ -31,7 +31,7 @@ from teds_provision.station.store.sqlite import sqlite3
 
 if TYPE_CHECKING:
     import fcntl
-else:  # no such module on Windows, where nodes are not used
+else:  # Windows has no fcntl, and uses no nodes
     fcntl = late("fcntl")
 
 FILE_NAME = "store.lock"
@@ -116,7 +116,7 @@ class StoreLock(_HeldFile):
     def _acquire(self, descriptor: int) -> None:
         self._lock(descriptor)
         with suppress(OSError):  # a full disk must not hide the store's own, better message
-            # over the last holder's text, which is obsolete: cutting a file off costs more than a step
+            # Overwrite the text of the last holder: truncating the file costs more than a step.
             _write_at_start(descriptor, _signature(self._command).ljust(_SIGNATURE_OCTETS))
 
     def _try_to_lock(self, descriptor: int) -> None:
@@ -151,7 +151,7 @@ class StoreLock(_HeldFile):
                 self._notice(f"Waiting for the store, locked by {_holder(descriptor)}.")
                 reported = True
             time.sleep(pause)
-            # a durable step of another command takes milliseconds, and others wait for its end as well
+            # Poll often: a durable step takes milliseconds, and other processes wait for the same lock.
             pause = min(2 * pause, _POLL_SECONDS if reported else _LAST_QUIET_POLL_SECONDS)
 
 
@@ -184,12 +184,12 @@ class UsageLock(_HeldFile):
         except OSError as error:
             raise as_store_failure(error, self._path) from error
         self.left_behind = bool(_read_at_start(descriptor, 1))
-        with suppress(OSError):  # as above
+        with suppress(OSError):  # a full disk must not hide the store's own, better message
             os.ftruncate(descriptor, 0)
             _write_at_start(descriptor, _signature(self._command))
 
     def _release(self, descriptor: int) -> None:
-        if self._shared:  # the last one puts it away
+        if self._shared:  # only the last holder gets the exclusive lock and clears the mark
             lock(descriptor)
         os.ftruncate(descriptor, 0)
 
@@ -271,7 +271,7 @@ def _held_by(path: Path, *, shared: bool = False) -> str | None:
         lock(descriptor, shared=shared)
     except BlockingIOError:
         return _holder(descriptor)
-    except OSError:  # no locks here, so none that is held
+    except OSError:  # a file system without locks, so none is held
         return None
     finally:
         os.close(descriptor)
@@ -282,7 +282,7 @@ def _holder(descriptor: int) -> str:
     try:
         holder = json.loads(_read_at_start(descriptor, 4096))
         if Path("/proc/self").exists() and not Path(f"/proc/{int(holder['pid'])}").exists():
-            return "another process"  # of several who shared it, the last to come has gone
+            return "another process"  # of several that share the lock, the last one that wrote its text has ended
         return f"pid {int(holder['pid'])} ({holder['command']}) since {holder['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "another process"
@@ -305,7 +305,7 @@ class _LockedOctet(_HeldFile):
         try:
             descriptor = os.open(self._path, os.O_RDWR | NOFOLLOW | CLOSING)
         except OSError:
-            return False  # no octet of this file was ever locked
+            return False  # without the file, no octet was ever locked
         try:
             answer = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._lock_struct())
         except OSError:

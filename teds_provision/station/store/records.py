@@ -34,14 +34,14 @@ def utc_now() -> str:
     return _second(int(time.time()))
 
 
-@lru_cache(maxsize=2)  # a step asks for the time again and again
+@lru_cache(maxsize=2)  # each step reads the time several times
 def _second(second: int) -> str:
     return iso(datetime.fromtimestamp(second, UTC))
 
 
 def iso(moment: datetime) -> str:
     """Return a moment (aware) as ``2026-01-31T12:00:00Z``."""
-    at = moment.astimezone(UTC)  # by hand: a quarter of what strftime costs, and every step asks for the time
+    at = moment.astimezone(UTC)  # formatted by hand, in a quarter of the time of strftime: each step needs the time
     return f"{at.year:04}-{at.month:02}-{at.day:02}T{at.hour:02}:{at.minute:02}:{at.second:02}Z"
 
 

@@ -142,11 +142,11 @@ class _Column:
         first, last = self._end("ASC"), self._end("DESC")
         while first != last:
             middle = _between(first, last, random_one=False)
-            if not first < middle <= last:  # a text that is no number
+            if not first < middle <= last:  # not a number
                 middle = last
             lower = random.random() < 0.5
             found = self._end("DESC", "<", middle) if lower else self._end("ASC", ">=", middle)
-            if found is None:  # in a damaged file alone
+            if found is None:  # only in a damaged file
                 break
             first, last = (first, found) if lower else (found, last)
         return first
@@ -171,7 +171,7 @@ def _between(first: Any, last: Any, *, random_one: bool = True) -> Any:
             low, high = bytes.fromhex(first), bytes.fromhex(last)
         except ValueError:
             return _between(first.encode(), last.encode(), random_one=random_one).decode(errors="ignore")
-        return _between(low, high, random_one=random_one).hex()  # of other characters none is a key
+        return _between(low, high, random_one=random_one).hex()  # such keys are all hex
     size = max(len(first), len(last))
     low_number, high_number = int.from_bytes(first.ljust(size, b"\0")), int.from_bytes(last.ljust(size, b"\xff"))
     return int(_between(low_number, high_number, random_one=random_one)).to_bytes(size)

@@ -14,10 +14,10 @@ SCHEMA_VERSION: Final = 15
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
-# Schema 7, whole. Columns of MACs (16 octets) are the seals of rows that decide whom the station believes.
+# Schema 7, complete. MAC columns (16 octets) protect the rows that decide whom the station trusts.
 _TABLES: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
-    # -- the station itself: taken_over is no longer written, but backups list it
+    # -- the station itself; taken_over is no longer written, but backups have it
     """CREATE TABLE station(
         one INTEGER PRIMARY KEY CHECK(one = 1), name TEXT NOT NULL CHECK(name <> ''),
         keystore TEXT NOT NULL CHECK(keystore IN ('keyring', 'file') OR keystore GLOB 'pkcs11:*'),
@@ -55,7 +55,7 @@ _TABLES: Final = (
         UNIQUE(uuid, key_id), UNIQUE(uuid, epoch, slot)) STRICT""",
     "CREATE UNIQUE INDEX one_active_key ON keys(uuid) WHERE state = 'active'",
     "CREATE TABLE key_slots(uuid BLOB PRIMARY KEY, last INTEGER NOT NULL) STRICT, WITHOUT ROWID",
-    # -- what was built for a node, what it was seen with, and the one reading that verdicts are judged from
+    # -- drafts, datasheets, and the one reading per node that verdicts are computed from
     """CREATE TABLE drafts(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), blocks BLOB NOT NULL,
         stage TEXT NOT NULL CHECK(stage IN ('built', 'signed')), profile TEXT, created TEXT NOT NULL)
@@ -143,9 +143,9 @@ _GROUP_NAME: Final = """CASE WHEN each.value IN ('all', '.', '..') OR length(eac
     THEN rtrim('group ' || substr(each.value, 1, 58)) ELSE each.value END"""
 
 _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
-    # the content of the profile from which a node's datasheet was made
+    # The digest of the profile from which a node's datasheet was built.
     8: ("ALTER TABLE nodes ADD COLUMN profile_digest TEXT",),
-    # measurements that take in nodes as they come: the rule for rows differs, so the table is rebuilt
+    # Measurements that nodes join as they come: a CHECK of the table differs, so the table is rebuilt.
     9: (
         "ALTER TABLE measurements RENAME TO measurements_before",
         """CREATE TABLE measurements(
@@ -163,9 +163,9 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         "INSERT INTO measurements SELECT *, NULL, 0 FROM measurements_before",
         "DROP TABLE measurements_before",
     ),
-    # the plant: its stations' statements (contract/plant.md); empty until `registry connect`
+    # The plant: its stations' statements (contract/plant.md); empty until `registry connect`.
     10: (
-        # -- what this station has to do with it; macs are seals
+        # -- this station's membership; mac columns protect rows
         """CREATE TABLE plant(
         one INTEGER PRIMARY KEY CHECK(one = 1), registry TEXT NOT NULL CHECK(length(registry) = 36),
         joined TEXT NOT NULL, left TEXT, url TEXT, synced TEXT,
@@ -179,7 +179,7 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         """CREATE TABLE alarms(
         code TEXT NOT NULL, about TEXT NOT NULL, n INTEGER NOT NULL, why TEXT NOT NULL, at TEXT NOT NULL,
         seen INTEGER NOT NULL DEFAULT 0 CHECK(seen IN (0, 1)), PRIMARY KEY(code, about, n)) STRICT, WITHOUT ROWID""",
-        # -- what this station says: events that wait for a page, and the pages of everybody, its own among them
+        # -- events of this station that wait for a page, and the pages of all stations, including its own
         """CREATE TABLE outbox(
         seq INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE CHECK(length(id) = 16),
         event TEXT NOT NULL) STRICT""",
@@ -196,7 +196,7 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         """CREATE TABLE heads(
         chain INTEGER NOT NULL REFERENCES chains(chain), about TEXT NOT NULL CHECK(length(about) = 64),
         n INTEGER NOT NULL, hash TEXT NOT NULL, PRIMARY KEY(chain, about)) STRICT, WITHOUT ROWID""",
-        # -- what follows: claims per node and station, digests and statements, and what is still to be judged anew
+        # -- derived data: claims per node and station, digests and statements, and the queue of nodes to merge again
         """CREATE TABLE event_ids(
         chain INTEGER NOT NULL, id INTEGER NOT NULL, PRIMARY KEY(chain, id)) STRICT, WITHOUT ROWID""",
         """CREATE TABLE claims(
@@ -217,7 +217,7 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         uuid BLOB NOT NULL CHECK(length(uuid) = 10), conflict TEXT NOT NULL, detail TEXT NOT NULL,
         PRIMARY KEY(uuid, conflict)) STRICT, WITHOUT ROWID""",
         "CREATE TABLE to_judge(uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10)) STRICT, WITHOUT ROWID",
-        # -- parcels, and for whom a copy was made
+        # -- parcels, and the receivers of copies
         """CREATE TABLE parcels(
         id TEXT NOT NULL, direction TEXT NOT NULL CHECK(direction IN ('out', 'in')),
         peer TEXT NOT NULL CHECK(length(peer) = 64), kind TEXT NOT NULL, state TEXT NOT NULL, expires TEXT NOT NULL,
@@ -227,7 +227,7 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         uuid BLOB NOT NULL CHECK(length(uuid) = 10), epoch INTEGER NOT NULL, receiver TEXT NOT NULL,
         parcel TEXT NOT NULL, state TEXT NOT NULL, PRIMARY KEY(uuid, epoch, receiver)) STRICT, WITHOUT ROWID""",
         "CREATE INDEX shared_in_parcel ON shared(parcel)",
-        # -- a line: jobs, their units, evidence, what an office was asked and answered
+        # -- a line: jobs, their units, evidence, and requests to an office with its answers
         """CREATE TABLE jobs(
         id TEXT PRIMARY KEY, hash TEXT NOT NULL CHECK(length(hash) = 64), octets BLOB NOT NULL, state TEXT NOT NULL,
         at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
@@ -247,18 +247,18 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         "CREATE INDEX sign_requests_of_unit ON sign_requests(job, uuid)",
     ),
     11: (
-        # the bus or the air on which a session with a node was opened last: searched first by default
+        # The link on which a session with the node was last opened; searched first by default.
         """CREATE TABLE last_places(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), place TEXT NOT NULL CHECK(place <> ''))
         STRICT, WITHOUT ROWID""",
     ),
     12: (
-        # chosen coordinate frames of channels (0: of the whole node)
+        # Chosen coordinate frames of channels (0: of the whole node).
         """CREATE TABLE frames(
         uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
         frame TEXT NOT NULL CHECK(frame <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",
     ),
-    # the owner of each measurement, from which follows whether it lasts; an earlier one that did not was a command's
+    # The owner of each measurement, which decides whether it lasts; earlier ones that did not last were a command's.
     13: (
         "ALTER TABLE measurements RENAME TO measurements_before",
         """CREATE TABLE measurements(
@@ -281,9 +281,9 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         require, match, frozen, NULL, NULL FROM measurements_before""",
         "DROP TABLE measurements_before",
     ),
-    # groups are kept once: what a bundle or `replace` wrote into the row of a node joins the measurement groups. A name
-    # that no group may have gets a word before it, as station/groups.py `valid_name` gives it. Nodes that were taken
-    # out of service leave their groups, as `decommission` and `replace` do today (handover/life.py).
+    # Groups are stored in one place: those that a bundle or `replace` wrote into a node's row are merged into the
+    # measurement groups. Invalid names get a prefix, as station/groups.py `valid_name` does it. Retired nodes leave
+    # their groups, as `decommission` and `replace` do today (handover/life.py).
     14: (
         "INSERT OR IGNORE INTO groups"
         f" SELECT DISTINCT {_GROUP_NAME}, strftime('%Y-%m-%dT%H:%M:%SZ', 'now') FROM {_NODES_GROUPS}",
@@ -293,7 +293,7 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         "ALTER TABLE nodes DROP COLUMN groups",
         "CREATE INDEX groups_of_node ON group_members(uuid)",
     ),
-    # what nodes report of their firmware, and under which one their datasheet was signed
+    # Firmware that nodes report, and the firmware under which their datasheets were signed.
     15: (
         """CREATE TABLE firmware(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10),

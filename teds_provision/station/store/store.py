@@ -79,8 +79,8 @@ class Store(Database):
         """
         try:
             page = int(self.execute("PRAGMA page_size")[0][0])
-            file = str(self.execute("PRAGMA database_list")[0][2])  # "" for the private one of a backup
-            if file and Path(file).stat().st_size % page:  # SQLite reads zeros for the octets that are missing
+            file = str(self.execute("PRAGMA database_list")[0][2])  # "" for the in-memory store of a backup
+            if file and Path(file).stat().st_size % page:  # SQLite reads missing octets as zeros
                 return "The file ends within a page."
             found = self._checked("1") if sample is None else self._spot_check(sample)
         except StoreError as failure:
@@ -109,7 +109,7 @@ class Store(Database):
         """Read the identifier, which wrapped keys and the audit log are bound to; make it in a new store."""
         row = self.first_row("SELECT value FROM meta WHERE name = 'id'")
         if row is None and create:
-            with self.transaction():  # OR IGNORE: another process may have been first
+            with self.transaction():  # OR IGNORE: another process may have inserted it first
                 fresh = secrets.token_hex(_ID_OCTETS)
                 self.execute("INSERT OR IGNORE INTO meta VALUES('id', ?)", (fresh,))
                 row = self.first_row("SELECT value FROM meta WHERE name = 'id'")

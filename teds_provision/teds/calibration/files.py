@@ -29,11 +29,11 @@ from teds_provision.teds.units import parse_unit
 
 if TYPE_CHECKING:
     from teds_provision.teds.dcc import items, signature
-else:  # lxml: not for a calibration that is no certificate
+else:  # imports lxml: only for certificates
     items, signature = late("teds_provision.teds.dcc.items"), late("teds_provision.teds.dcc.signature")
 
-# The CSV reader takes delimiter, decimal comma, header, units and metadata as instruments and spreadsheets write them.
-# Columns whose name begins with "#" are remarks.
+# The CSV reader accepts delimiters, decimal commas, headers, units and metadata as instruments and spreadsheets write
+# them. Columns whose name begins with "#" are remarks.
 
 MAXIMUM_ROWS: Final = 200_000
 _CHANNEL_DIGITS: Final = 5
@@ -338,7 +338,7 @@ def read_certified(
         certificate.signature,
         (*certificate.warnings, *certificate.unchecked),
     )
-    reference.encode()  # raises if the number does not fit
+    reference.encode()  # raises if the number is too large
     return {channel.number: replace(calibration, certificate=reference)}
 
 

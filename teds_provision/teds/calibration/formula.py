@@ -48,7 +48,7 @@ class PreparedCurve:
         self._inner = [np.asarray(part.boundaries[1:-1], dtype=np.float64) for part in parts]
         self._offsets = [np.asarray(part.offsets, dtype=np.float64) for part in parts]
         self._powers = tuple(itertools.product(*(range(part.degree + 1) for part in parts)))
-        self._plain = len(self._table) == 1  # one cell: no search, no gathering
+        self._plain = len(self._table) == 1  # one cell: no segment to search
 
     def __call__(self, *inputs: Floats) -> Floats:
         """Return the results for one array per input."""
@@ -187,7 +187,7 @@ def evaluate(calibration: Calibration, *inputs: object) -> object:
 
 Points = Sequence[tuple[float, float]]
 MAXIMUM_DEGREE = 12
-MAXIMUM_NODES = 8000  # 8 octets of coefficients each, in one tuple of at most 65535
+MAXIMUM_NODES = 8000  # 8 octets of coefficients each, in one tuple of at most 65,535 octets
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def left_out(calibration: Calibration) -> tuple[float, ...]:
         others = [point for point in points if point[0] != raw]
         try:
             curve = fit(others, calibration.method, channel=calibration.channel, degree=degree)
-        except BadDataError:  # too few are left
+        except BadDataError:  # too few points are left
             return ()
         found.append(value - evaluate(curve, raw).value)
     return tuple(found)

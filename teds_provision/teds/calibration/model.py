@@ -148,7 +148,7 @@ class Calibration:
         if self.date > now + timedelta(days=1):
             out.append(f"the calibration date {self.date:%Y-%m-%d} lies in the future.")
         due = self.due
-        if due is None and demanded_interval:  # it states no interval itself: that of its type holds
+        if due is None and demanded_interval:  # the certificate gives no interval, so that of the type applies
             due = replace(self, interval=demanded_interval).due
         if due is not None and due < now:
             late = (now - due).days

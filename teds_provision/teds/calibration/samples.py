@@ -43,7 +43,7 @@ MODEL_NAMES: Final = (
     "long fraction",
     "time of day",
 )
-# Octets that one sample of a model has, first and last; models that are not here are reserved.
+# Octets of one sample, minimum and maximum, by data model; other models are reserved.
 _OCTETS: Final = {
     DataModel.UNSIGNED: (1, 8),
     DataModel.FLOAT32: (4, 4),
@@ -150,7 +150,7 @@ class SampleReader:
         if model in _FLOATS:
             return np.ascontiguousarray(rows).view(_FLOATS[DataModel(model)])[:, 0].astype(np.float64)
         if model == DataModel.TIME_OF_DAY:
-            # TimeInstance: seconds, and nanoseconds whose highest bit is the sign of the whole
+            # TimeInstance: seconds, and nanoseconds whose highest bit is the sign of the whole value.
             seconds = _words(rows[:, :4]).astype(np.float64)
             nanoseconds = _words(rows[:, 4:])
             value = seconds + (nanoseconds & (_NEGATIVE - 1)).astype(np.float64) * 1e-9
@@ -194,8 +194,8 @@ class SampleReader:
     def _integer(self, number: float) -> bytes:
         whole, used = 8 * self.form.octets, self.form.bits
         bits = used if 0 < used < whole else whole
-        if self.form.model in _FRACTIONS:  # the leading bits count, the others stay 0
-            # number × 2^bits to the nearest integer, exact however many bits there are
+        if self.form.model in _FRACTIONS:  # the leading bits are used, the others are 0
+            # number × 2^bits to the nearest integer, exact for any number of bits
             above, below = min(max(number, 0.0), 1.0).as_integer_ratio()
             steps = ((above << (bits + 1)) + below) // (2 * below)
             return (min(steps, (1 << bits) - 1) << (whole - bits)).to_bytes(self.form.octets, "big")

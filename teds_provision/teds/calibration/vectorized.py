@@ -70,7 +70,7 @@ class ManyChannels:
         self._bounded = bool(np.isfinite(self._floor).all() and np.isfinite(self._ceiling).all())
         self._shifted = bool(self._zero.any())
         self._scaled = bool((self._scale != 1.0).any() or self._offset.any())
-        # The largest value that a curve may take: where it is far from the largest number, nothing can overflow.
+        # An upper bound for the curve's values: if it is far below the largest float, nothing can overflow.
         reach = 2.0 ** (8 * self._width) + np.abs(self._offsets).max()
         with np.errstate(all="ignore"):
             largest = sum(np.abs(term).max() * reach**power for power, term in enumerate(self._terms))
@@ -106,7 +106,8 @@ class ManyChannels:
         """Arrange the curves as one table; a channel without one gives its raw values (one segment, C = [0, 1])."""
         parts = [curve.inputs[0] for curve in curves if curve is not None]
         segments = max((part.segments for part in parts), default=1)
-        degree = max([1, *(part.degree for part in parts)])  # steps have 0: then the second coefficient is 0
+        # step functions have degree 0: their second coefficient is 0
+        degree = max([1, *(part.degree for part in parts)])
         count = len(curves)
         self._inner = np.full((count, segments - 1), np.inf)
         self._offsets = np.zeros((count, segments))

@@ -94,7 +94,7 @@ def with_zero_offset(teds: bytes, offset: float, at: datetime) -> bytes:
     new = [RawTuple(*composer.encode_field(name, value, fields.by_name)[:2], 0) for name, value in given.items()]
     head, *kept = tuples(unframe(teds), width=width)
     rest = [raw for raw in kept if raw.type not in {entry.type for entry in new}]
-    for entry in new:  # before the first of a higher type: a TEDS of ours stays in ascending order
+    for entry in new:  # keep the ascending order of types, as in all TEDS of this program
         at_place = next((n for n, raw in enumerate(rest) if raw.type > entry.type), len(rest))
         rest.insert(at_place, entry)
     return frame(

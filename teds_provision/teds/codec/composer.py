@@ -206,7 +206,7 @@ def _again(field: Field, known: Mapping[int, FieldSpec], fields: Table | None, e
         spec = fields.inner.get(field.type)
     if field.children and spec is not None:
         inner = b"".join(_again(child, spec.by_type, fields, edition, width) for child in field.children)
-        # Octets that are no whole tuple made no child: keep them.
+        # Octets that do not form a whole tuple have no child: keep them.
         return raw_tuple(field.type, inner + field.raw[len(inner) :], width=width)
     return raw_tuple(field.type, _leaf(field, spec, edition), width=width)
 
@@ -247,7 +247,7 @@ def _tail(decoded: DecodedTeds) -> bytes:
     return decoded.octets[start:end]
 
 
-# A decoded TEDS in the words of the other edition, with a finding for everything that the other cannot say.
+# Converts a decoded TEDS to the other edition, with a finding for each value that the other edition cannot represent.
 
 _VERSIONS: Final = {(2007, 1): 2, (2024, 2): 1}
 _UUID_OCTETS: Final = {2007: 10, 2024: 16}

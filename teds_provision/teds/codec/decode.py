@@ -27,7 +27,7 @@ from teds_provision.teds.codec.plausibility import check
 from teds_provision.teds.codec.tables import MANUFACTURER, ONLY_2024, TEXT_BASED, FieldSpec, Table, name_of, table
 from teds_provision.teds.codec.values import READERS, is_packed_units, split_text, units_of
 
-# The head of a decoding: Length and checksum, TEDSID, and the list of findings.
+# The start of decoding: Length and checksum, TEDSID, and the list of findings.
 
 MAX_OCTETS: Final = 16 << 20
 MAX_TUPLES: Final = 32768

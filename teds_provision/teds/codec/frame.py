@@ -32,7 +32,8 @@ class RawTuple(NamedTuple):
 
 def checksum(octets: bytes) -> int:
     """Return 0xFFFF minus the sum of all octets modulo 65536 (Length included, checksum excluded)."""
-    # The lower half of Adler-32 is 1 plus the sum, modulo 65521, which 256 octets never reach: far quicker than sum().
+    # The lower half of Adler-32 is 1 plus the sum, modulo 65521, which 256 octets never reach; this is much faster than
+    # sum().
     if len(octets) <= _SUMMED:
         return 0x10000 - (adler32(octets) & 0xFFFF)
     pieces = [adler32(octets[at : at + _SUMMED]) & 0xFFFF for at in range(0, len(octets), _SUMMED)]

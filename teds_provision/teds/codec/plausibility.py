@@ -15,9 +15,9 @@ from teds_provision.teds.codec.tables import LEVELS, FieldSpec, Table
 Find = Callable[..., None]
 
 PROFILE_VERSION: Final = 105
-# Octets that one sample of these data models must have; the other models take any number in their range.
+# Octets per sample that these data models require; the other models allow any number in their range.
 _MODEL_OCTETS: Final = {1: (4, 4), 2: (8, 8), 0: (0, 8), 7: (8, 8), 5: (9, 255), 6: (9, 255)}
-# Field numbers of the TransducerChannel TEDS (docs/teds.md): the sample's form, and how it may be sampled.
+# Field numbers of the TransducerChannel TEDS (docs/teds.md): the sample's form and the sampling modes.
 _SAMPLE, _DATA_MODEL, _MODEL_LENGTH, _SIGNIFICANT_BITS = 18, 40, 41, 42
 _SAMPLING, _SAMPLING_MODES, _DEFAULT_MODE = 31, 48, 49
 _TINY, _HUGE, _PLAUSIBLE = 1e-30, 1e300, (1e-9, 1e12)

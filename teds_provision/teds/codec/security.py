@@ -23,7 +23,8 @@ TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
 SIGNATURE, NODE_KEY, NODE_KEY_SIGNATURE, STATION_KEY, STATION_KEY_SIGNATURE = 100, 101, 102, 103, 104
 SIGNED_BLOCK, PROFILE_VERSION, SESSION_SUITE, KEY_AGREEMENT = 108, 105, 109, 110
 
-# Our values of Tables 2 to 5, ProfileVersion, SessionSuite and KeyAgreement: the only ones built, accepted or trusted.
+# The profile's values for Tables 2 to 5, ProfileVersion, SessionSuite and KeyAgreement; no others are built or
+# accepted.
 OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 2}
 _U8 = (1, 2, 3, 4, 105, 109, 110)
 _BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
@@ -149,7 +150,7 @@ def decode(teds: bytes) -> SecurityTeds:
     return _read(block, layout, values)
 
 
-@lru_cache(maxsize=128)  # as decode: what is decoded is checked next, over the octets that are signed
+@lru_cache(maxsize=128)  # cached too: after decode, the same octets are verified
 def _walked(teds: bytes) -> tuple[bytes, _Layout, tuple[bytes, ...]]:
     """Return the data block of a framed Security TEDS, its layout and the values; raises BadDataError."""
     block = unframe(teds)
@@ -244,7 +245,7 @@ def _cut(block: bytes) -> tuple[_Layout, tuple[bytes, ...]]:
     layout = _LAYOUTS.get(len(block))
     if layout is not None:
         parts = layout.parts.unpack(block)
-        # The first head says where the second one is, and so on: if all are the same, so is every place.
+        # Each head determines the next offset; if all heads are equal, so are all offsets.
         if parts[::2] == layout.heads:
             return layout, parts[1::2]
     places = _places(block)

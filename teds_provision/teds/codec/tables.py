@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.model import MANUFACTURER, ONLY_2024, TEXT_BASED
 
-# What a field table is made of, and the names of the TEDS classes (teds.md, "Access codes").
+# The parts of a field table, and the names of the TEDS classes (teds.md, "Access codes").
 
 Need = Literal["R", "R?", "O"]
 Confidence = Literal["H", "M", "L", "MEM", "unverified"]
@@ -44,7 +44,7 @@ NAMES: Final[Mapping[int, str]] = {
     AccessCode.CERTIFICATE: "CertificateTEDS",
 }
 
-# Octets of the kinds of value that have a fixed number of them; UUID, TEDSID and TimeInstance depend on the edition.
+# Octets of value kinds with a fixed length; UUID, TEDSID and TimeInstance depend on the edition.
 OCTETS: Final[Mapping[str, tuple[int, ...]]] = {
     "u8": (1,),
     "u16": (2,),
@@ -301,7 +301,8 @@ NAME: Final = (
     _row(4, "Format", "u8", "R", enumeration=_FORMAT, enumeration_confidence="H", meaning="layout of the name"),
     _row(5, "TCName", "text", "R", meaning="name that the user gave the transducer"),
 )
-# The explanatory text of the same clause counts 10 and 11; nobody is known to write them, we read them.
+# The explanatory text of the same clause numbers these fields 10 and 11; no known software writes them, but they are
+# read.
 NAME_ALIASES: Final = {
     10: _row(10, "Format", "u8", confidence="L", enumeration=_FORMAT, meaning="Format in the numbering of the text"),
     11: _row(11, "TCName", "text", confidence="L", meaning="TCName in the numbering of the text"),
@@ -318,7 +319,7 @@ TABLES: Final[dict[int, dict[str, Any]]] = {
 
 RADIO: Final = {0: "IEEE 802.11", 1: "Bluetooth", 2: "ZigBee", 3: "6LoWPAN", 255: "manufacturer"}
 
-# Tables 2 to 5 of Mitterer et al. 2023. The weak or never implemented ones are read, named, and never written.
+# Tables 2 to 5 of Mitterer et al. 2023. Weak schemes and ones that were never implemented are decoded, never written.
 SECURITY_SCHEMES: Final = {
     0: "NoSec",
     1: "AsVerification",

@@ -18,7 +18,7 @@ from teds_provision.teds.codec.model import Edition
 
 _ARC_SECONDS: Final = 3600
 _FORMS: Final = {
-    # edition: bits of latitude, longitude, manufacturer, year, time
+    # Edition: bits of latitude, longitude, manufacturer, year, time.
     2007: (20, 20, 4, 12, 22),
     2024: (23, 23, 24, 16, 40),
 }

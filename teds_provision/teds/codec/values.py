@@ -302,14 +302,12 @@ def pairs_of(name: str, fields: object) -> list[tuple[str, object]]:
     raise _refuse(name, "is a mapping of field names, or a sequence of (name, value) pairs")
 
 
-# Text-based TEDS: a directory of languages in tuples, then the texts outside of any tuple.
-#
+# Text-based TEDS: a directory of languages in tuples, followed by the texts outside any tuple.
 # See teds.md, "Text-based TEDS (2, 4, 6, 10, 11, 14, 15)".
 #
-# Two points are open in every source: what ``Offset`` counts from and over what ``SubSum`` is taken. We write
-# Offset from the first octet of the TEDS (its Length), SubSum as the TEDS checksum over the tuples before it, and
-# ``Length`` as the text with its own two checksum octets; we read texts by their order and Length, whatever Offset
-# says.
+# The sources leave two points open: the origin of ``Offset`` and the range of ``SubSum``. We write Offset from the
+# first octet of the TEDS (its Length), SubSum as the TEDS checksum over the tuples before it, and ``Length`` as the
+# text with its own two checksum octets. We read texts by their order and Length, and ignore Offset.
 
 Tuples = Callable[[list[tuple[str, object]], Mapping[str, FieldSpec]], bytes]
 _BY_NAME = {row.name: row for row in TEXT}
@@ -350,7 +348,7 @@ def _text(value: object) -> tuple[str, bytes, int]:
 
 def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., None]) -> tuple[bytes, ...]:
     """Split off the texts after the directory, without their checksums; deviations go to ``find``."""
-    # octets of each text, as the directory counts them
+    # Octets of each text, as stated in the directory.
     entries = (child for field in fields if field.name == "DirBlock" for child in field.children)
     known = [child.value for child in entries if child.type == 22 and isinstance(child.value, int)]
     if known and sum(known) == len(area) and min(known) >= 2:

@@ -359,7 +359,7 @@ def _numeric(node: Node) -> Node | None:
     choices = found[0].children_named(*_NUMERIC)
     known = [choice for choice in choices if _is_readable(choice)]
     if choices and not known:
-        _values(choices[0])  # raises
+        _values(choices[0])  # raises the error
     certain = [choice for choice in known if _uncertainties(choice, len(_values(choice)[0]))[0]]
     return next(iter([*certain, *known]), None)
 
@@ -399,7 +399,7 @@ def _numbers(node: Node) -> tuple[float, ...]:
     return tuple(out)
 
 
-# Elements that state an uncertainty: path, the name of its numbers, and whether a factor k belongs to them.
+# Elements with an uncertainty: path, the name of its numbers, and True if it has a factor k.
 _STATED: Final = (
     ("si:expandedUnc", "si:uncertainty", True),
     ("si:coverageInterval", "si:standardUnc", False),

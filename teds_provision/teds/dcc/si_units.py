@@ -38,7 +38,7 @@ _PREFIXES: Final = {
         "atto": -18,
     }.items()
 }
-# The name in the certificate, and the unit of our table (or a scale of one) that it is.
+# The certificate's name, our unit, and the scale between them.
 _UNITS: Final = {
     "one": ("1", 1.0),
     "percent": ("1", 1e-2),
@@ -75,7 +75,7 @@ _UNITS: Final = {
     "henry": ("H", 1.0),
     "lumen": ("lm", 1.0),
     "lux": ("lx", 1.0),
-    "degreecelsius": ("K", 1.0),  # in a product a difference; alone it has its zero, below
+    "degreecelsius": ("K", 1.0),  # a difference in a product; alone, its zero is handled below
     "litre": ("m³", 1e-3),
     "electronvolt": ("J", 1.602176634e-19),
 }
@@ -128,7 +128,7 @@ def _factors(text: str) -> list[tuple[str, float, Fraction]]:
     """Return name, prefix and power of each factor."""
     factors: list[tuple[str, float, Fraction]] = []
     at, prefix, side = 0, 1.0, 1
-    powered = True  # no unit yet that a power could belong to
+    powered = True  # True: so far there is no unit that a power could apply to
     pending = False
     while at < len(text):
         match = _TOKEN.match(text, at)

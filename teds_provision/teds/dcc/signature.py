@@ -134,7 +134,8 @@ def _results(octets: bytes, file: str, signature: Node, signer: x509.Certificate
             f"The signature of {file} is bad: {str(error)[:160]}.",
             hint="The file was changed after it was signed, or another key signed it. Ask the laboratory for it again.",
         ) from error
-    except Exception as error:  # lxml's, cryptography's and signxml's own, on a form that they do not take
+    # lxml, cryptography and signxml raise their own classes for forms that they do not support
+    except Exception as error:
         raise _UnsupportedError(" ".join(str(error).split())[:160].rstrip(".") or type(error).__name__) from error
     return [result.signed_xml for result in verified if result.signed_xml is not None]
 
@@ -160,7 +161,7 @@ def _chain(signature: Node) -> list[x509.Certificate]:
                 one.not_valid_before_utc,
                 one.not_valid_after_utc,
                 one.public_key(),
-            )  # parsed late
+            )  # parsed only when read: raises here if damaged
         except (ValueError, binascii.Error, UnsupportedAlgorithm) as error:
             raise _UnsupportedError("a certificate in it cannot be read") from error
         found.append(one)

@@ -212,7 +212,7 @@ def _result(results: ET.Element, number: int, calibration: Calibration, laborato
     _name(result, f"Points of channel {number}")
     data = ET.SubElement(
         result, "dcc:data", {"refId": f"channel-{number}"}
-    )  # PTB's rules ask that an id is referred to
+    )  # PTB's rules require that each id is referenced
     table = ET.SubElement(data, "dcc:list", {"id": f"channel-{number}"})
     unit = calibration.unit
     uncertainty = calibration.uncertainty

@@ -50,7 +50,7 @@ __all__ = [
 Format = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml"]
 Kind = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml", "bundle"]
 FORMATS: Final[tuple[str, ...]] = get_args(Format)
-# A list, where TOML would have the name of a table.
+# A JSON list; in TOML, "[" would begin the name of a table.
 _JSON_LIST: Final = re.compile(r"\[\s*(?:\{|\]|\[\s*[\[\]{])")
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 
@@ -186,7 +186,7 @@ def _image(blocks: Sequence[TedsBlock]) -> str:
     return Image(uuid, placed).to_json()
 
 
-# The TEDS of one node out of a document that holds them: which channel each belongs to, and whose they are.
+# Finds the TEDS of one node in a document: the channel of each, and the UUID of the node.
 
 UUID_OCTETS: Final = 10
 _META: Final[BlockId] = (0, AccessCode.META)

@@ -17,8 +17,8 @@ from teds_provision.teds.image import TedsBlock, class_of, split_run, with_class
 
 # Hex digits in a text: ``#`` comments, white space, commas and ``0x`` are skipped.
 #
-# Ours puts a comment ``# channel 1 access code 3`` before each TEDS; read back, it gives the place, and where the next
-# TEDS begins. Other people's comments mean nothing.
+# This program writes a comment ``# channel 1 access code 3`` before each TEDS; when read, it gives the place and the
+# beginning of the next TEDS. Other comments are ignored.
 
 _PLACE: Final = re.compile(r"#\s*channel (\d{1,5}|-) access code (\d{1,3}|-)(?=\s|$)")
 _SKIP: Final = re.compile(r"0[xX](?=[0-9A-Fa-f])|[\s,]+")

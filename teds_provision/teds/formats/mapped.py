@@ -69,9 +69,9 @@ def _root(octets: bytes, file: str) -> Element:
         root: Element = fromstring(octets, forbid_dtd=True)
     except DefusedXmlException as error:
         raise BadDataError(f"{file} has a DTD or entities, which are not read.", hint="Remove the DOCTYPE.") from error
-    except (ParseError, ValueError, LookupError) as error:  # no XML, or in an encoding that nobody knows
+    except (ParseError, ValueError, LookupError) as error:  # not XML, or in an unknown encoding
         raise BadDataError(f"{file} is not XML: {error}.") from error
-    for element in root.iter():  # a lab's namespace is not a part of its names
+    for element in root.iter():  # ignore a laboratory's namespace
         if isinstance(element.tag, str):
             element.tag = element.tag.rpartition("}")[2]
     return root
@@ -142,4 +142,4 @@ def _toml(value: Any) -> str:
         return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value)  # a string, a number, true or false: as TOML writes them
+    return json.dumps(value)  # a string, a number, true or false: written as in TOML

@@ -27,7 +27,7 @@ from teds_provision.teds.profile.model import CalibrationDemand, ChannelProfile,
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Problems, Section, TomlTable
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
-# The channels of a profile: ``[channel.all]``, ``[channel.1-12]``, ``[channel.3]``, laid over each other, checked.
+# The channels of a profile: ``[channel.all]``, ``[channel.1-12]``, ``[channel.3]``, merged and checked.
 
 MAXIMUM_CHANNEL: Final = 255
 _RANGE: Final = re.compile(r"(\d+)(?:-(\d+))?\Z")

@@ -76,7 +76,7 @@ def load_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None
     name = profile.name if profile else str(name_or_path)
     found = Problems(list(problems))
     found.raise_errors(name)
-    if profile is None:  # no error and no profile cannot be
+    if profile is None:  # for mypy: without errors there is a profile
         raise BadDataError(f"The profile {name} cannot be read.")
     return profile
 
@@ -91,7 +91,7 @@ def parse_profile(text: str, name: str = "profile") -> Profile:
     problems = Problems()
     profile = interpret(table, name, path.name, lineage, problems)
     problems.raise_errors(name)
-    if profile is None:  # no error and no profile cannot be
+    if profile is None:  # for mypy: without errors there is a profile
         raise BadDataError(f"The profile {name} cannot be read.")
     return profile
 
@@ -240,7 +240,7 @@ def _base(name: str, where: SourcePlace, path: Path, folders: Sequence[Path], ch
         raise BadDataError(f"{where}: extends: {error.message}", hint=error.hint) from error
 
 
-# A profile as plain data, in the units that its author wrote: for ``profile show`` and JSON.
+# A profile as plain data, in its author's units: for ``profile show`` and JSON.
 
 _TYPES: Final = {code: name for name, code in CHANNEL_TYPES.items()}
 
@@ -307,7 +307,7 @@ def describe_channel(channel: ChannelProfile) -> dict[str, Any]:
     }
 
 
-# The commented text that ``profile new`` writes: every key there is, made from the same tables that read it.
+# The commented text that ``profile new`` writes: every key, generated from the tables that the reader uses.
 
 
 def template(name: str) -> str:

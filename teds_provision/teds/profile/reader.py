@@ -18,10 +18,10 @@ from teds_provision.limits import LIMITS, check_depth, check_toml
 from teds_provision.teds.profile.keys import Key, KeyKind, KeyNeed
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
-# TOML read with the place of every key: a profile's error names file, line and field.
+# TOML read with the position of every key, so that an error in a profile names file, line and field.
 #
-# ``tomllib`` gives values without lines, so a small scan over the text finds where each key stands. Values keep the
-# file they came from through inheritance.
+# ``tomllib`` gives values without lines, so a small scanner finds the position of each key. Values keep the name of
+# their file through inheritance.
 
 KeyPath = tuple[str | int, ...]
 
@@ -174,7 +174,7 @@ def walk(table: TomlTable) -> Iterator[tuple[str, PlacedValue]]:
 
 
 _LIMITS = {KeyKind.U8: 0xFF, KeyKind.U16: 0xFFFF, KeyKind.U32: 0xFFFF_FFFF}
-_SHOWN = 60  # characters of a wrong value that a message shows
+_SHOWN = 60  # characters of a wrong value in a message
 FLOAT32_MAXIMUM = 3.4028234663852886e38
 NAME_OCTETS = 120
 """The longest name, as UTF-8: what wire, labels and lists have room for."""
@@ -196,7 +196,7 @@ class ProfileProblem:
 
 def _shown(value: object) -> str:
     """Return a value of the file as a message shows it."""
-    if isinstance(value, tuple):  # of Table
+    if isinstance(value, tuple):  # the type of a list of tables (Table)
         return "a list of tables [[…]]"
     text = repr(value)
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"

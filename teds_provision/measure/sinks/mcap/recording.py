@@ -60,7 +60,7 @@ _OFFERED = (
 )
 RELIABLE = _OFFERED.format(depth=100, durability="volatile", never=_NEVER)
 LATCHED = _OFFERED.format(depth=1, durability="transient_local", never=_NEVER)
-_HEAD = b"\x00\x01\x00\x00"  # how a CDR message begins
+_HEAD = b"\x00\x01\x00\x00"  # the start of a CDR message
 LITTLE_ENDIAN = int.from_bytes(_HEAD, "little")
 
 
@@ -76,7 +76,7 @@ class McapSink(FileSink):
         self._streams: dict[tuple[str, int, tuple[int, ...], str], tuple[int, np.ndarray]] = {}
         self._strings: dict[str, int] = {}
         self._topics: Topics | None = None
-        self._in_chunk = 0  # values that wait in the open chunk
+        self._in_chunk = 0  # values in the open chunk
 
     @property
     def _out(self) -> McapWriter:
@@ -149,7 +149,7 @@ class McapSink(FileSink):
         for uuid in uuids:
             every = [facts_as_json(facts) for facts in self.facts.values() if facts.uuid == uuid]
             self._string(self._names.of_node(uuid, "teds"), json.dumps({"uuid": uuid, "channels": every}), time.time())
-        # A stream's topic carries facts in its metadata, so changed ones need a topic record of their own.
+        # A stream's topic has facts in its metadata, so changed facts need a new topic record.
         self._streams = {key: value for key, value in self._streams.items() if key[0] not in uuids}
         if self._scalars is not None:
             self._scalars = {key: value for key, value in self._scalars.items() if key[0] not in uuids}
@@ -211,7 +211,7 @@ class McapSink(FileSink):
         self._out.metadata("note", {"time": iso(at), "note": text})
 
     def _close_part(self) -> None:
-        # After a failure the summary does not fit either; `measure recover` makes the file whole later.
+        # After a failure the summary would be wrong too; `measure recover` repairs the file later.
         if self._writer is not None and self._part is not None and self.stats.state != "failed":
             writer, self._writer = self._writer, None
             writer.finish()
@@ -222,7 +222,7 @@ class McapSink(FileSink):
         return waiting + super()._abandon()
 
     def _mend(self, path: Path) -> None:
-        with suppress(TedsProvisionError):  # what cannot be mended stays as it is, for `measure recover`
+        with suppress(TedsProvisionError):  # what cannot be repaired is kept for `measure recover`
             recover(path)
 
 
@@ -242,7 +242,7 @@ def samples(block: Block, plain: np.ndarray) -> np.ndarray:
     """Return a message record of SAMPLES for each instant of a block; ``plain`` comes from :func:`plain_samples`."""
     raw = block.raw
     if raw.dtype.kind == "O":
-        # Octet strings have no place in this message; what is a number in them is kept as nearly as a float can.
+        # This message has no octet strings: NaN for them, and for numbers the nearest float.
         raw = np.array(
             [[cell if isinstance(cell, int | float) else np.nan for cell in row] for row in raw.tolist()],
             dtype=np.float64,

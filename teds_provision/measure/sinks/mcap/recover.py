@@ -45,8 +45,8 @@ from teds_provision.measure.sinks.mcap.writer import (
 from teds_provision.measure.sinks.mcap.zstandard_frames import ZstdError, decompress_frame
 from teds_provision.portable import CLOSING, NONBLOCK, lock
 
-LARGEST_RECORD: Final = 1 << 28  # a length beyond it is damage
-_PRIVATE: Final = 0x80  # op codes from here on are free for private use
+LARGEST_RECORD: Final = 1 << 28  # a longer length means damage
+_PRIVATE: Final = 0x80  # op codes from here on are for private use
 _FOOTER_OCTETS: Final = HEAD.size + 20
 _ZSTD: Final = text("zstd")
 _IN_A_CHUNK: Final = HEAD.size + CHUNK_HEAD.size  # offset of the compression's name
@@ -165,11 +165,11 @@ class _Chunk:
     """
 
     offset: int
-    begin: int  # of its indexes: where it ends itself
-    end: int  # of its indexes
+    begin: int  # offset of its indexes, which is its own end
+    end: int  # end of its indexes
     packed: int
     unpacked: int
-    span: tuple[int, int]  # earliest and latest log time, as its messages have them
+    span: tuple[int, int]  # earliest and latest log time of its messages
     counts: dict[int, tuple[int, int, int]]  # by channel: messages, earliest, latest
     described: list[tuple[int, bytes]]  # schemas and channels in it: op code, content
     indexes: list[tuple[int, int, int]] = field(default_factory=list)
@@ -217,10 +217,10 @@ class _Scan:
             raise _no_mcap(path)
         self.octets, self.path = octets, path
         self.damaged: list[Damage] = []
-        self.end = len(MAGIC)  # of what is whole
-        self.chunk: _Chunk | None = None  # the last one
+        self.end = len(MAGIC)  # end of the undamaged records
+        self.chunk: _Chunk | None = None  # the last chunk
         self.ended = False
-        self._kept: list[tuple[int, int] | _Chunk] = []  # records by place and length, chunks with their indexes
+        self._kept: list[tuple[int, int] | _Chunk] = []  # records as (begin, end), and chunks with their indexes
         self._spoiled: list[bytes] = []  # bodies of damaged chunks
         self._limit = len(octets)
         self._summary = b""
@@ -244,7 +244,7 @@ class _Scan:
         if finished and not good:
             self._damage("summary", at, len(self.octets))
         if not finished:
-            # What is damaged behind the last good record of an unfinished file is its torn end
+            # In an unfinished file, damage after the last good record is its torn end.
             self.damaged = [damage for damage in self.damaged if damage.offset < self.end]
         self._join_damage()
 
@@ -280,7 +280,7 @@ class _Scan:
         if code == MESSAGE_INDEX:
             if length < 6 or length != 6 + int.from_bytes(content[2:6], "little") or length % 16 != 6:
                 return None
-            if self.chunk is None:  # of a chunk that is damaged
+            if self.chunk is None:  # the index of a damaged chunk
                 if not self.damaged or self.damaged[-1].offset + self.damaged[-1].octets != at:
                     return None
                 self._damage("chunk", at, after)
@@ -384,7 +384,7 @@ class _Scan:
         begin = at + HEAD.size + len(content)
         return _Chunk(at, begin, begin, packed, len(body), span, counts, described)
 
-    # -- the end that belongs to it -----------------------------------------------------------------------------------
+    # -- the summary --------------------------------------------------------------------------------------------------
 
     def assembled(self, put: Callable[[bytes], object] | None) -> McapSummary:
         """Return the summary of all that is whole, in order, unchanged or as ``put`` gets it."""
@@ -397,7 +397,7 @@ class _Scan:
             else:
                 octets = self.octets[chunk[0] : chunk[1]]
                 at = _record_into(summary, octets, at, put)
-            if put is not None and count == 0:  # behind the header
+            if put is not None and count == 0:  # after the header
                 for described in self._rescued():
                     at = _record_into(summary, described, at, put)
         if put is not None:
@@ -443,7 +443,7 @@ class _Scan:
                 for code, content in kept.described:
                     _describe(known, code, content)
         elsewhere = McapSummary()
-        for body in (*self._spoiled, self._summary):  # the summary, whose checksum holds, has the last word
+        for body in (*self._spoiled, self._summary):  # the summary has a good checksum, so it takes precedence
             for _, code, content in _inside(body):
                 if code in (SCHEMA, CHANNEL) and _parses(code, content):
                     _describe(elsewhere, code, content)

@@ -27,9 +27,9 @@ from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, 
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 from teds_provision.one_core import every_core
 
-# The Python that a ROS came with: another one than ours, with other versions of everything.
+# The Python of a ROS installation, which differs from ours in its version and packages.
 
-PROBING = 60.0  # seconds: an import of rospy takes one on a machine that is not busy
+PROBING = 60.0  # seconds: importing rospy takes one on an idle machine
 
 
 def imports(python: str, packages: str, environment: dict[str, str]) -> bool:
@@ -51,9 +51,9 @@ def environment(*, sourced: bool) -> dict[str, str]:
     return kept
 
 
-NO_MASTER, NAME_TAKEN = 3, 4  # exit codes of a child whose master is gone, whose name another program took
-STUCK = 2.0  # seconds without a taken octet: then the child is dead, whatever its process state is
-ENDING = 5.0  # seconds for the child to publish what it has, and end
+NO_MASTER, NAME_TAKEN = 3, 4  # exit codes of a child: its master is gone, another program took its name
+STUCK = 2.0  # seconds without an octet read: then the child counts as dead, whatever its process state is
+ENDING = 5.0  # seconds for the child to publish its queue and end
 BACK_OFF = (1.0, 30.0)
 COMPLAINT = 200  # characters of the last line of stderr that are reported
 
@@ -66,11 +66,11 @@ class ChildSink(TopicSink):
         self._library = library
         self._child: subprocess.Popen[bytes] | None = None
         self._ready = threading.Event()
-        self._announced = False  # to this child
+        self._announced = False  # True if the facts were sent to this child
         self._heard = self._complaint = self._suffix = ""
         self._numbers: dict[str, int] = {}
         self._count_up = count()
-        self._named: dict[str, tuple[str, ...]] = {}  # the names that the child has for a topic of arrays
+        self._named: dict[str, tuple[str, ...]] = {}  # the names that the child knows for a topic of arrays
         self._again = 0.0
         self._pause = BACK_OFF[0]
 
@@ -98,7 +98,7 @@ class ChildSink(TopicSink):
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,  # warnings; the last line is reported if the child dies
                 env=self._environment(),
-                start_new_session=True,  # a Ctrl-C at the terminal is for the parent, which ends its child in order
+                start_new_session=True,  # Ctrl-C in the terminal reaches only the parent, which ends its child in order
             )
         assert self._child.stdin is not None
         os.set_blocking(self._child.stdin.fileno(), False)

@@ -16,7 +16,7 @@ from typing import Any
 
 LO = b"lo"
 PORTS, FIRST_PORT = 250, 7400  # of a DDS domain; of domain 0
-HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
+HISTORY = 100  # messages that a reader may lag behind, enough for a burst of rows
 
 INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
@@ -232,7 +232,7 @@ def main() -> None:
     node = rclpy.create_node(sys.argv[1])
     if on_this_machine_alone():
         keep_on_loopback(ports_of(int(os.environ.get("ROS_DOMAIN_ID", "0"))))
-        keep_on_loopback(range(1, 10_000))  # Fast DDS has one more, 7000
+        keep_on_loopback(range(1, 10_000))  # Fast DDS uses one more port, 7000
     bridge = Bridge(rclpy, node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -244,7 +244,7 @@ def main() -> None:
     executor.shutdown(1.0)
     node.destroy_node()
     rclpy.shutdown()
-    # Threads of a middleware may hang on a peer that is gone; everything that had to go out has gone out.
+    # Threads of the middleware may hang on a peer that is gone, and all output has been sent.
     os._exit(0)
 
 

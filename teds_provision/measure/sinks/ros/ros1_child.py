@@ -23,12 +23,12 @@ import time
 from contextlib import suppress
 from typing import Any
 
-WATCH = 1.0  # seconds between looks at the master
+WATCH = 1.0  # seconds between checks of the master
 NO_MASTER, NAME_TAKEN = 3, 4
-QUEUE = 1000  # messages that one subscriber may be behind: bursts of rows, and what a busy machine held up, fit
-MEETING = 1.0  # seconds for subscribers that the master knows of to connect
-KNOWN = 0.3  # seconds for which the master's list of subscribers is believed
-BURST, PAUSE = 20, 0.002  # messages that go at once, and the pause after them: else they fall out of a queue
+QUEUE = 1000  # messages that one subscriber may lag behind: enough for bursts of rows and delays of a busy machine
+MEETING = 1.0  # seconds for the subscribers that the master lists to connect
+KNOWN = 0.3  # seconds for which the master's list of subscribers is reused
+BURST, PAUSE = 20, 0.002  # messages sent at once, and the pause after them: more would overflow a queue
 LEAVING = 1.0  # seconds for the last messages to leave
 
 INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
@@ -49,7 +49,7 @@ def wait_for_master(rosgraph: Any) -> None:
     reported, parent = False, os.getppid()
     while not rosgraph.is_master_online():
         if os.getppid() != parent:
-            os._exit(0)  # a parent that was killed closes our stdin, which is not read yet
+            os._exit(0)  # reading stdin would show that the parent was killed, but it is not read yet
         if not reported:
             send_line(event="waiting", master=os.environ.get("ROS_MASTER_URI", "http://localhost:11311"))
             reported = True
@@ -130,7 +130,7 @@ class Bridge:
         """Return how many nodes subscribe to a topic, as the master knows it; some of them may be dead."""
         if time.monotonic() > self._subscribed[0] + KNOWN:
             found = {}
-            with suppress(Exception):  # whatever a socket, or the master itself, throws at an XML-RPC client
+            with suppress(Exception):  # an XML-RPC client raises errors of the socket and of the master
                 found = {name: len(nodes) for name, nodes in self.master.getSystemState()[1]}
             self._subscribed = time.monotonic(), found
         return self._subscribed[1].get(topic, 0)
@@ -268,7 +268,7 @@ def main() -> None:
         getattr(bridge, words["op"])(words)
     bridge.end()
     rospy.signal_shutdown("the parent has ended")
-    # Threads of rospy may hang on a subscriber that is gone; everything that had to go out has gone out.
+    # Threads of rospy may hang on a subscriber that is gone, and all output has been sent.
     os._exit(0)
 
 

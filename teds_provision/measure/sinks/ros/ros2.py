@@ -25,23 +25,23 @@ from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
 if TYPE_CHECKING:
     from teds_provision.measure.sinks.ros import ros2_types
-else:  # cyclonedds: an extra
+else:  # cyclonedds is an extra
     ros2_types = late("teds_provision.measure.sinks.ros.ros2_types")
 
 GRAPH = "rmw_dds_common/ParticipantEntitiesInfo"
 DISTRIBUTIONS = ("humble", "iron", "jazzy", "kilted", "lyrical", "rolling")
-HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
-PARTICIPANTS = 10 + 2 * 31 + 2  # ports of a domain that 31 participants have
-NEWEST = 10  # set points that may wait here
-BLOCKING_MS = 10  # how long a slow reliable reader may hold up a write, at most
-LISTENING = 0.2  # seconds between looks whether the end has come
+HISTORY = 100  # messages that a reader may lag behind, enough for a burst of rows
+PARTICIPANTS = 10 + 2 * 31 + 2  # the ports that 31 participants of a domain use
+NEWEST = 10  # set points that may be queued
+BLOCKING_MS = 10  # longest time that a slow reliable reader may delay a write
+LISTENING = 0.2  # seconds between checks for the end
 THIS_MACHINE = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
     "<AllowMulticast>false</AllowMulticast></General><Discovery><Peers><Peer address='127.0.0.1'/></Peers>"
     "<SPDPInterval>2s</SPDPInterval><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex></Discovery>"
     "<Tracing><Verbosity>none</Verbosity></Tracing></Domain></CycloneDDS>"
 )
-_domains: dict[int, Any] = {}  # a domain is configured once in a process
+_domains: dict[int, Any] = {}  # a domain can be configured only once in a process
 
 
 def domain_of(spec: str) -> int:
@@ -69,7 +69,7 @@ class Ros2Sink(TopicSink):
         self._ending = threading.Event()
         self._listener: threading.Thread | None = None
         self._types: Any = None
-        self._unshown = False  # endpoints that the graph has not been told of
+        self._unshown = False  # True if endpoints changed since the graph was published
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         super()._prepare(facts, station)
@@ -198,7 +198,7 @@ class Ros2Sink(TopicSink):
             part = message
             for name in way:
                 part = getattr(part, name)
-            if hasattr(part, last):  # Range has a variance from Jazzy on
+            if hasattr(part, last):  # Range has a variance since Jazzy
                 setattr(part, last, value)
         self._write(self._writer(topic, kind), message, sum(isinstance(value, float) for value in fields.values()))
 
@@ -206,7 +206,7 @@ class Ros2Sink(TopicSink):
         self._write(self._writer(topic, STRING, latched=True), self._types.String(words), 0)
 
     def _retire(self, topic: str) -> None:
-        if self._writers.pop(topic, None) is not None:  # it goes with its last reference
+        if self._writers.pop(topic, None) is not None:  # the writer ends with its last reference
             self._unshown = True
 
     def _parameter(self, name: str, value: object) -> None:
@@ -274,7 +274,7 @@ class Ros2Sink(TopicSink):
         self._ending.set()
         if self._listener is not None:
             self._listener.join(10 * LISTENING)
-        # Entities go with their last reference; the participant says good-bye to the others.
+        # Entities end with their last reference; the participant announces its end to the others.
         self._attached.clear()
         self._readers.clear()
         self._writers.clear()

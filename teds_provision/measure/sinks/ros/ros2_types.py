@@ -86,7 +86,7 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
             return octets
         stamp = self.header.stamp
         octets = _STAMP.pack(b"\0\1\0\0", stamp.sec, stamp.nanosec)
-        # Cyclone's own name for a sequence does not contain the element type.
+        # Cyclone's own cast names the sequence, but not its element type.
         names, *numbers = cast("tuple[Sequence[Any], ...]", (self.name, self.position, self.velocity, self.effort))
         octets += _names_in_cdr(self.header.frame_id, tuple(names))
         for part in numbers:

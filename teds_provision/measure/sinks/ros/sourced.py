@@ -86,7 +86,7 @@ class RclpySink(ChildSink):
         if self._own and not _REACH & around.keys():
             around["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         if not ({"ROS_LOG_DIR", "ROS_HOME"} & around.keys() or os.access(around.get("HOME", ""), os.W_OK)):
-            around["ROS_LOG_DIR"] = tempfile.gettempdir()  # of a service without a home: rclpy dies without a place
+            around["ROS_LOG_DIR"] = tempfile.gettempdir()  # rclpy needs a folder for logs, and a service has no home
         return around
 
     def _program(self) -> list[str]:
