@@ -55,7 +55,9 @@ def _names(node: DescribedNode) -> dict[int, str]:
     found: dict[int, str] = {}
     for channel in node.sheet.channels:
         own = re.sub(r"\W+", "_", channel.name.lower(), flags=re.ASCII).strip("_") or f"channel_{channel.number}"
-        found[channel.number] = f"{own}_{channel.number}" if own in found.values() else own
+        while own in found.values():  # "a", "a 3" and "a" as channels 1, 2 and 3 need the number twice
+            own = f"{own}_{channel.number}"
+        found[channel.number] = own
     return found
 
 

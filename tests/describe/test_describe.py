@@ -75,6 +75,19 @@ def test_a_thing_description_validates_and_its_forms_are_the_api(
     assert (value["minimum"], value["maximum"], value["unit"]) == (actuator.low, actuator.high, actuator.si_unit)
 
 
+def test_each_channel_has_a_property_of_its_own_whatever_the_channels_are_called(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    """The third "flow" took the name of "flow 3", which was described no more."""
+    node = gripper(station, board, tmp_path)
+    sensor = next(channel for channel in node.sheet.channels if not channel.actuator)
+    names = ("Flow", "flow 3", "flow", "", "!")
+    channels = tuple(replace(sensor, number=number, name=name) for number, name in enumerate(names, 1))
+    described = thing_description(replace(node, sheet=replace(node.sheet, channels=channels)))["properties"]
+    numbers = {name: found["teds:channel"] for name, found in described.items()}
+    assert numbers == {"flow": 1, "flow_3": 2, "flow_3_3": 3, "channel_4": 4, "channel_5": 5}
+
+
 def test_xacro_expands_the_macro_with_the_limits_of_the_datasheet(
     station: Station, board: Board, tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.station.station import Station
+from teds_provision.teds.sheet import Sheet
 from tests.cli.shell import PROGRAM
 from tests.e2e.desk import ANGLE
 from tests.measure.rig import Rig, events
@@ -46,18 +47,24 @@ def test_nodes_are_listed_by_name_those_that_are_there_first(prepared: Path, tmp
         assert [node["name"] or None for node in listed.nodes()] == ["zebra", "Arm 1", "arm 2", "arm 10", None]
 
 
-def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest() -> None:
-    nothing: Any = None
+def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest(prepared: Path, tmp_path: Path) -> None:
+    """The units in which their datasheets were shown had been kept: a few hundred octets for each invented UUID."""
+    shutil.copytree(prepared / "bench", tmp_path / "bench")
     silence: Any = NoListeners()
-    roster = NodeDirectory(nothing, silence)
-    roster.note("a" * 20, "came", present=True, looked=1.0)
-    for number in range(5 * MOST_GONE):
-        uuid = f"{number:020x}"
-        roster.note(uuid, "came", present=True, looked=1.0)
-        roster.note(uuid, "left", present=False)
-    assert len(roster.uuids()) == MOST_GONE + 1
-    assert not roster.known(f"{0:020x}")
-    assert {"a" * 20, uuid} <= set(roster.uuids())
+    with Station.inspect(tmp_path / "bench") as station:
+        roster = NodeDirectory(station, silence)
+        roster.note("a" * 20, "came", present=True, looked=1.0)
+        for number in range(2 * MOST_GONE):
+            uuid = f"{number:020x}"
+            roster.note(uuid, "came", present=True, looked=1.0)
+            roster.show_sheet(uuid, Sheet.from_blocks({}))
+            roster.nodes_text(1, number % 2)
+            roster.note(uuid, "left", present=False)
+        assert len(roster.uuids()) == MOST_GONE + 1
+        assert not roster.known(f"{0:020x}")
+        assert {"a" * 20, uuid} <= set(roster.uuids())
+        kept = {name: held for name, held in vars(roster).items() if isinstance(held, dict) and f"{0:020x}" in held}
+        assert not kept
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeBusyError
-from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
+from teds_provision.errors import NodeBusyError, NoNodeError
+from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, NodeLocks
+from tests.pace import PATIENCE, until
 
 NODE = "ab" * 10
 
@@ -21,6 +23,65 @@ def test_of_requests_that_wait_for_one_tap_the_first_is_served_first() -> None:
         jobs.wait_for(uuid, "provision", lambda _node, name=name: done.append(name), 60.0)
     assert [jobs.serve(tapped) for _ in range(4)] == [True, True, True, False]
     assert done == ["first", "whichever comes next", "last"]
+
+
+def test_a_tap_after_the_time_of_a_request_is_not_for_it_and_who_waited_gives_it_up() -> None:
+    """A tap between the two took the request away unserved: its waiter waited for ever, and no other could begin."""
+    none: Any = None
+    tapped: Any = SimpleNamespace(tapped=True, uuid=bytes.fromhex(NODE))
+    jobs, done = NodeJobs(none, none, none), list[str]()
+    late = jobs.wait_for(NODE, "provision", lambda _node: done.append("late"), -1.0)
+    jobs.wait_for(NODE, "provision", lambda _node: done.append("in time"), 60.0)
+    assert [jobs.serve(tapped) for _ in range(2)] == [True, False]
+    assert done == ["in time"]
+    assert (jobs.cancel(late), jobs.cancel(late)) == (True, False)
+
+
+class TappedAtTheEnd(NodeJobs):
+    """Whose node is tapped when the time for that is nearly over; the work goes on until it is waited for."""
+
+    waited_for = threading.Event()
+
+    def wait_for(self, *request: Any) -> NodeJob[Any]:
+        """Let the node come, and its work begin, before the caller waits."""
+        job = super().wait_for(*request)
+        job.done.wait = self._wait  # type: ignore[method-assign]
+        tapped: Any = SimpleNamespace(tapped=True, uuid=bytes.fromhex(NODE))
+        self.reader = threading.Thread(target=self.serve, args=(tapped,))
+        self.reader.start()
+        until(lambda: job not in self._waiting)
+        return job
+
+    def _wait(self, timeout: float | None = None) -> bool:
+        if timeout is None:
+            self.waited_for.set()
+            self.reader.join()
+        return timeout is None
+
+
+def test_work_that_began_within_the_time_for_a_tap_is_waited_for() -> None:
+    """The request was told that no node came, while its datasheet was being written."""
+    none: Any = None
+    absent: Any = SimpleNamespace(seen=lambda _uuid: SimpleNamespace(present=False, place=""))
+    jobs = TappedAtTheEnd(absent, none, none)
+
+    def work(_node: Any) -> str:
+        jobs.waited_for.wait(PATIENCE)
+        return "written"
+
+    try:
+        assert jobs.with_node(NODE, "a datasheet is written", work, wait=0.01) == "written"
+    finally:
+        jobs.waited_for.set()
+
+
+def test_a_node_that_is_not_tapped_in_time_is_reported() -> None:
+    none: Any = None
+    absent: Any = SimpleNamespace(seen=lambda _uuid: SimpleNamespace(present=False, place=""))
+    jobs = NodeJobs(absent, none, none)
+    with pytest.raises(NoNodeError, match="was not placed on a reader"):
+        jobs.with_node(NODE, "write", lambda _node: None, wait=0.0)
+    assert not jobs._waiting
 
 
 def test_a_node_that_a_measurement_gave_back_is_frozen_no_more() -> None:

@@ -76,7 +76,7 @@ def test_gaps_invalid_and_lost_samples_are_distinguished() -> None:
     past = History()
     past.block(block(NOW - 8, [[1.0, 5.0]] * 100, index=0))
     past.block(block(NOW - 5, [[1.0, 5.0]] * 100, index=300, valid=[[False, True]] * 100))  # 200 were lost before it
-    past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=0, run=1))  # begun again: nothing was lost
+    past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=900, run=1))  # begun again: nothing was lost between
     first, second = (past.channel_history(NODE, number, NOW - 60, NOW) for number in (1, 2))
     by_second = {at - NOW: place for place, at in enumerate(first["time"]) if first["bin"] == 1.0}
     if not by_second:  # the minute: in 10 ms
@@ -115,6 +115,33 @@ def test_samples_that_come_a_little_late_belong_where_they_are_dated() -> None:
     past.block(block(NOW - 6.5, [[-1.0]], index=500))
     history = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
     assert (history["low"][3], history["count"][3], len(history["time"])) == (-1.0, 101, 5)
+
+
+@pytest.mark.parametrize(("seconds", "rate"), [(50, 100.0), (70, None)])
+def test_a_channel_has_a_rate_for_a_minute_after_its_last_value(
+    seconds: int, rate: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    past = History()
+    ramp(past, NOW - 20, 20)
+    monkeypatch.setattr("time.time", lambda: NOW + seconds)
+    assert past.channel_history(NODE, 1)["rate"] == rate
+
+
+def test_a_bin_counts_to_its_end_and_no_further() -> None:
+    """One sample more than a count holds must neither begin again at 0 nor end the thread that takes them in."""
+    few = FewBins(1.0, 60)
+    for _ in range(300):
+        few.add_one(7, 1.0, 1, 0, 0)
+    assert few.between(0, 9)[3][:2, 0].tolist() == [255, 255]
+    for coarse, most in ((True, 255), (False, 65535)):
+        bins = Bins(1.0, 60, coarse=coarse)
+        many = np.full((3, 1), most - 1)
+        bins.add(np.array([7]), np.array([1.0]), np.array([2.0]), many, 0)
+        for _ in range(3):
+            bins.add_one(7, 1.5, 1, 1, 0)
+        assert bins.between(0, 9)[3][:, 0].tolist() == [most, most, 0 if coarse else most]
+        bins.add(np.array([7]), np.array([1.0]), np.array([2.0]), many, 0)
+        assert bins.between(0, 9)[3][0, 0] == most
 
 
 def test_the_ring_of_an_hour_forgets_what_is_older() -> None:

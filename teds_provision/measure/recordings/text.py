@@ -130,10 +130,8 @@ class TextRecording(Recording):
         named: dict[str, State] = {
             state_name: state_name for state_name in ("waiting", "running", "lost", "refused", "ended")
         }
-        why = state[8].rpartition("; ")[2] if "; " in state[8] else ""
-        return NodeReport(
-            state[1], named[state[2]], why[: MOST.text], samples, lost, late, bad, invalid, time=unix_of(timed[1])
-        )
+        why = _reason(state[8][: 4 * MOST.text])[: MOST.text]
+        return NodeReport(state[1], named[state[2]], why, samples, lost, late, bad, invalid, time=unix_of(timed[1]))
 
     def _rows(self, lines: Sequence[str], streams: Streams) -> Iterator[Entry]:
         table = [line.split(self._comma) for line in lines]
@@ -181,6 +179,16 @@ class TextRecording(Recording):
             [_raw(column, self._known[k].sample_form) for k, column in zip(places, raws, strict=True)],
             np.array([[bool(cell) for cell in raw] for raw in raws]).T.reshape(count, len(places)),
         )
+
+
+def _reason(rest: str) -> str:
+    """Return the node's reason behind its counts; parentheses before it hold why values are invalid."""
+    depth = 0
+    for place, sign in enumerate(rest):
+        depth += (sign == "(") - (sign == ")")
+        if not depth and rest.startswith("; ", place):
+            return rest[place + 2 :]
+    return ""
 
 
 def _number(cell: str) -> float:

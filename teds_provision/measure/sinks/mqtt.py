@@ -191,6 +191,8 @@ class MqttSink(ThreadedSink):
         """Announce facts that are new or changed, and those of a node whose topics have been renamed."""
         changed = [channel_facts.key for channel_facts in facts if self._facts.get(channel_facts.key) != channel_facts]
         self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
+        for uuid in {uuid for uuid, _ in changed}:
+            self._newest.pop(uuid, None)  # under a channel's former name its last value would go on as one of now
         own = {channel_facts.uuid for channel_facts in facts}
         touched = {uuid for uuid in self._topics.learn(facts) if uuid in own or uuid in self._parts_of_topics}
         self._units.update(

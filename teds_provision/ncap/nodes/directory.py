@@ -175,8 +175,9 @@ class NodeDirectory:
                     for other, node_presence in self._seen.items()
                     if not node_presence.present and other not in self._rows
                 ]
+                of_each = (self._seen, self._channels, self._shown_in, self._own_names, self._origins, self._texts)
                 for stranger in gone[:-MOST_GONE]:
-                    for kept in (self._seen, self._channels, self._own_names, self._origins, self._texts):
+                    for kept in of_each:
                         kept.pop(stranger, None)
         if state is not None:
             members = {key: value for key, value in facts.items() if key in ("problem", "place", "busy")}

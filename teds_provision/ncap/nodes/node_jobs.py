@@ -109,7 +109,6 @@ class NodeJob(Generic[Result]):
     done: threading.Event = field(default_factory=threading.Event)
     result: Result | None = None
     error: TedsProvisionError | None = None
-    cancelled: bool = False
 
     def run(self, node: Conversation) -> None:
         """Do it; what is raised is kept for who waits."""
@@ -150,13 +149,12 @@ class NodeJobs:
                     raise lost.cause from lost
         errand = self.wait_for(uuid, what, work, wait)
         if not errand.done.wait(wait):
-            self.cancel(errand)
-            if not errand.done.is_set():
+            if self.cancel(errand):
                 raise NoNodeError(
                     f"Node {uuid} is on no bus of this station and was not placed on a reader within {wait:.0f} s.",
                     hint="Place it on the reader, or connect it to the bus.",
                 )
-            errand.done.wait()
+            errand.done.wait()  # it was tapped in time, and what was begun is not given up
         if errand.error is not None:
             raise errand.error
         return cast("Result", errand.result)
@@ -198,7 +196,6 @@ class NodeJobs:
             if errand not in self._waiting:
                 return False
             self._waiting.remove(errand)
-        errand.cancelled = True
         return True
 
     def serve(self, node: Conversation) -> bool:
@@ -206,9 +203,8 @@ class NodeJobs:
         if not node.tapped:
             return False
         uuid, now = node.uuid.hex(), time.monotonic()
-        with self._guard:
-            self._waiting = [job for job in self._waiting if job.until > now]
-            found = next((job for job in self._waiting if job.uuid in (uuid, None)), None)
+        with self._guard:  # one whose time is over stays for its waiter, which cancels it
+            found = next((job for job in self._waiting if job.uuid in (uuid, None) and job.until > now), None)
             if found is not None:
                 self._waiting.remove(found)
         if found is None:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from mcap.reader import make_reader
 
 from teds_provision.errors import UsageError
-from teds_provision.measure.blocks import Block, GroupRows, NodeReport, Note
+from teds_provision.measure.blocks import Block, GroupRows, InvalidValues, NodeReport, Note
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.recordings.summary import RecordingSummary
@@ -206,6 +206,19 @@ def test_entries_come_in_the_order_in_which_they_were_measured(tmp_path: Path) -
     assert isinstance(found[1], NodeReport)
     assert (found[1].uuid, found[1].why) == (ARM, "The link ended.")
     assert found[3] == noted
+
+
+@pytest.mark.parametrize("why", ["", "No message (3 s); again in 1 s"])
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".mcap"])
+def test_a_report_keeps_its_reason_apart_from_why_values_are_invalid(tmp_path: Path, suffix: str, why: str) -> None:
+    """Text gave the last of the reasons for invalid values, or of the node's own reason its last words."""
+    invalid = (InvalidValues(1, "above its high limit, 360 ° (a turn)", 66), InvalidValues(1, "no number", 2))
+    counts = {"samples": 99, "lost": 1, "late": 2, "bad": 3, "invalid": 68}
+    report = NodeReport(ARM, "lost", why, **counts, time=1_795_000_010.0, invalid_why=invalid)
+    path = recorded(tmp_path / f"run{suffix}", [block(), report])
+    *_, found = (entry for entry in open_recording(path).entries() if isinstance(entry, NodeReport))
+    assert (found.state, found.why) == ("lost", why)
+    assert {name: getattr(found, name) for name in counts} == counts
 
 
 def test_more_nodes_than_an_octet_counts_keep_their_samples_apart(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ import pytest
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.sinks import mqtt, open_sink
+from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.teds.units import parse_units
 from tests.e2e.desk import ROOT
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
@@ -347,6 +349,39 @@ def test_a_program_that_accepts_and_sends_nothing_is_reported_as_that(monkeypatc
             until(lambda: sink.stats.detail == f"the broker at 127.0.0.1:{port} has been silent for 1 s")
         finally:
             sink.close()
+
+
+class DeskClient:
+    """A client of a broker, as the library has it, which keeps what is published; mock, no broker is there."""
+
+    def __init__(self) -> None:
+        self.published: list[tuple[str, bytes | str]] = []
+
+    def publish(self, topic: str, payload: bytes | str, **_: object) -> SimpleNamespace:
+        """Take a message."""
+        self.published.append((topic, payload))
+        return SimpleNamespace(rc=0)
+
+
+def desk_sink(*facts: ChannelFacts) -> tuple[MqttSink, DeskClient]:
+    """Return a sink that is connected to a client on the desk."""
+    sink, client = MqttSink("mqtt://localhost"), DeskClient()
+    sink._prepare(facts, STATION)
+    sink._client = client
+    sink._connected.set()
+    return sink, client
+
+
+def test_a_channel_that_was_renamed_leaves_no_value_under_its_former_name() -> None:
+    """The last value of before went on beside the new ones, as if it were one of now."""
+    sink, client = desk_sink(ANGLE)
+    sink._process_item(block([[7]], [[1.5]]))
+    sink._process_item((replace(ANGLE, name="elbow"),))
+    sink._due.clear()
+    sink._process_item(block([[8]], [[2.5]]))
+    first, second = (json.loads(octets) for topic, octets in client.published if topic == "bench/arm")
+    assert set(first) - {"time"} == {"angle_1"}
+    assert set(second) - {"time"} == {"elbow_1"}
 
 
 def test_two_brokers_of_one_host_have_two_names() -> None:
