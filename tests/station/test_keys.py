@@ -118,9 +118,13 @@ def test_a_part_of_a_change_that_failed_takes_the_whole_with_it(station: Station
                 station.nodes.restore(NodeRecord(OTHER))
                 raise RuntimeError
 
-    with pytest.raises(StoreError, match="Part of this change failed"):
-        caught()
-    assert station.nodes.all() == []
+    for _ in range(2):  # the second time as the first: what failed once is over
+        with pytest.raises(StoreError, match="Part of this change failed"):
+            caught()
+        assert station.nodes.all() == []
+
+
+def test_a_part_that_failed_takes_no_more_than_its_savepoint_with_it(station: Station) -> None:
     with station.transaction():
         station.nodes.restore(NodeRecord(NODE))
         with suppress(NotFoundError), station._store.together():

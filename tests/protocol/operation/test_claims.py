@@ -6,6 +6,7 @@ import pytest
 
 from teds_provision.protocol.messages.firmware import ABOUT, FirmwareReport
 from teds_provision.protocol.messages.frames import (
+    Command,
     Function,
     Reason,
     read_teds,
@@ -122,10 +123,23 @@ def test_the_dead_man_lives_by_values_for_this_channel_alone(value: str) -> None
     assert states[6] == (ChannelState.ACTUATOR | ChannelState.SAFE | ChannelState.STOPPED, 0)
 
 
-def test_a_refused_value_does_not_feed_the_dead_man() -> None:
-    bench = acting(dead_man=200)
+@pytest.mark.parametrize(
+    ("refused", "reason"),
+    [
+        (write_data_set(4, b"\xff\xff"), Reason.OUT_OF_RANGE),
+        (set_values([(4, b"\xff\xff")]), Reason.OUT_OF_RANGE),
+        (write_data_set(4, b"\1"), Reason.BAD_FORM),
+        (set_values([(4, VALUE), (6, VALUE)]), Reason.WRONG_STATE),
+        (set_values([(4, VALUE), (1, VALUE)]), Reason.NOT_PERMITTED),
+        (write_data_set(4, VALUE), Reason.FAULT),
+        (set_values([(4, VALUE)]), Reason.FAULT),
+    ],
+)
+def test_a_refused_value_does_not_feed_the_dead_man(refused: Command, reason: Reason) -> None:
+    bench = acting(dead_man=200).operate(1)
     bench.later(150 * MS)
-    assert bench.reason(write_data_set(4, b"\xff\xff")) == Reason.OUT_OF_RANGE
+    bench.hardware.faults = {4} if reason == Reason.FAULT else set()
+    assert bench.reason(refused) == reason
     bench.later(50 * MS)
     assert safe(bench)
 

@@ -110,6 +110,34 @@ def test_a_drive_message_that_was_heard_moves_nothing_again_while_it_is_in_time(
     assert wheel.points == (100, 100), "the last counter: it feeds no dead-man"
 
 
+@pytest.mark.parametrize("wrong", ["late", "too far ahead", "forged", "beyond the hardware", "fault", "heard before"])
+def test_a_drive_message_that_moves_nothing_feeds_no_dead_man(wheel: Wheel, wrong: str) -> None:
+    bench = wheel.bench
+    heard = wheel.message(1000, 1000, hold=490 * MS)
+    wheel.hear(heard)
+    late = wheel.message(2000, 2000, hold=20 * MS)
+    bench.later(400 * MS)
+    match wrong:
+        case "late":
+            wheel.hear(late)
+        case "too far ahead":
+            wheel.hear(wheel.message(2000, 2000, now=bench.hardware.tick + 501 * MS, hold=1 * MS))
+        case "forged":
+            wheel.hear(wheel.message(2000, 2000)[:-1] + b"x")
+        case "beyond the hardware":
+            wheel.hear(wheel.message(2000, 4001))
+        case "fault":
+            bench.hardware.faults = {6}
+            wheel.hear(wheel.message(2000, 2000))
+        case "heard before":
+            wheel.hear(heard)
+    assert wheel.points == (1000, 1000)
+    bench.later(99 * MS)
+    assert wheel.points == (1000, 1000)
+    bench.later(1 * MS)
+    assert wheel.points == (100, 100)
+
+
 @pytest.mark.parametrize("short", [4, 6])
 def test_the_shortest_dead_man_of_all_its_actuators_limits_a_drive_message(short: int) -> None:
     bench = Bench().open()

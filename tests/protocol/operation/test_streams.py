@@ -146,7 +146,9 @@ def test_a_message_that_is_not_begun_when_the_next_is_full_is_dropped_whole() ->
     bench.until(159 * MS)
     (message,) = consumer.messages()
     assert (message.counter, values(message)) == (5, [150])
-    assert consumer.receiver.counts.lost == 5
+    assert consumer.receiver.counts.lost == bench.tim.missed == 5
+    assert bench.send(stop(0)).ok
+    assert bench.tim.missed == 5, "since the start, whatever ended"
 
 
 def test_the_last_counter_is_sent_and_ends_the_stream() -> None:
