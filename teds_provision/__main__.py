@@ -21,7 +21,7 @@ def main() -> None:
 
         output = stdout.guard()
         code = stdout.ended(
-            command_line.run(sys.argv[1:]), output, must_print=lambda: command_line.must_print(sys.argv[1:])
+            command_line.run(sys.argv[1:]), output, purpose=lambda: command_line.purpose_of(sys.argv[1:])
         )
         gc.freeze()  # skips the collection at exit, which takes a tenth of a short command
         sys.exit(code)

@@ -17,6 +17,7 @@ from teds_provision import __version__
 from teds_provision.cli.config_file import Defaults, anchored, config_path, read_config
 from teds_provision.cli.context import App, discard_output, print_message
 from teds_provision.cli.option_names import PARAMETERS
+from teds_provision.cli.stdout import Purpose
 from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import (
     BadDataError,
@@ -325,16 +326,15 @@ def _bug(arguments: list[str], error: Exception) -> int:
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
 
 
-def must_print(arguments: list[str]) -> bool:
-    """Return True if a run of these arguments has failed once its output is lost.
+def purpose_of(arguments: list[str]) -> Purpose:
+    """Return what a run of these arguments is for.
 
-    So it is with JSON, which a program reads, and with a command that only shows what is there. Any other has done its
-    work all the same.
+    It has failed once its output is lost if that is JSON, which a program reads, or if it only shows what is there.
+    Any other has done its work all the same.
     """
-    if _wants(arguments, "--json"):
-        return True
     name = _command_name(arguments)
-    return not name or (name in _SHOWING and "--output" not in arguments)
+    only_shows = not name or (name in _SHOWING and "--output" not in arguments)
+    return Purpose(only_shows, must_print=only_shows or _wants(arguments, "--json"))
 
 
 def _command_name(arguments: list[str]) -> str:

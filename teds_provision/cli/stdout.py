@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, Final
 
 BROKEN_PIPE: Final = 141
@@ -81,10 +82,22 @@ def guard() -> GuardedOutput | None:
     return output
 
 
-def ended(code: int, output: GuardedOutput | None, *, must_print: Callable[[], bool]) -> int:
+@dataclass(frozen=True)
+class Purpose:
+    """What a run is for, as far as lost output matters.
+
+    ``only_shows``: it shows what is there and changes nothing. ``must_print``: without its output it has failed.
+    """
+
+    only_shows: bool
+    must_print: bool
+
+
+def ended(code: int, output: GuardedOutput | None, *, purpose: Callable[[], Purpose]) -> int:
     """Write out what is left and return the exit code: ``code``, or 141 for a broken pipe.
 
-    If output was lost, and all else went well, 7 for what ``must_print``: a reader must not take silence for a result.
+    If output was lost, and all else went well, 7 for a run that ``must_print``: a reader must not take silence for a
+    result. ``purpose`` is called only if output was lost.
     """
     try:
         sys.stdout.flush()
@@ -95,13 +108,14 @@ def ended(code: int, output: GuardedOutput | None, *, must_print: Callable[[], b
         silence()
     if output is None or not output.failure:
         return code
+    of = purpose()
+    if of.only_shows or code:
+        text = f"The result could not be written to stdout: {output.failure}."
+    else:
+        text = f"The work is done, but its result could not be written to stdout: {output.failure}."
     with suppress(OSError):
-        print(
-            f"Error: The work is done, but its result could not be written to stdout: {output.failure}.",
-            file=sys.stderr,
-            flush=True,
-        )
-    return _NOT_PRINTED if code == 0 and must_print() else code
+        print(f"Error: {text}", file=sys.stderr, flush=True)
+    return _NOT_PRINTED if code == 0 and of.must_print else code
 
 
 def silence() -> None:

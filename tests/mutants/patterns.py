@@ -1084,7 +1084,7 @@ PATTERNS = (
     ),
     Pattern(
         "a list that was cut short is a failure",
-        "must_print",
+        "purpose_of",
         "name in _SHOWING and '--output' not in arguments",
         "False",
         "tests/cli/test_stdout.py",
