@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 import time
 from array import array
 from dataclasses import dataclass
@@ -232,26 +233,36 @@ class ClockMap:
         Delay only ever widens an exchange, on one side or the other. So the quickest request of all is better evidence
         than the mean of many, and so is the quickest reply. Their limits are carried to ``tick`` along the skew, whose
         uncertainty weakens old ones.
+
+        Plain numbers: arrays of another size after each exchange stay in the C library's cache of each node's thread.
         """
-        at = (np.array(self._ticks) - tick).astype(np.float64)
-        offsets, errors = np.array(self._offsets), np.array(self._errors)
-        base = offsets[-1]
+        at = [float(moment - tick) for moment in self._ticks]
+        base, errors = self._offsets[-1], self._errors
+        offsets = [offset - base for offset in self._offsets]
+        best, span = min(errors), max(at) - min(at)
         edge, skew = self._by_arrivals(tick)
-        if len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:
-            skew = self._skew_of(at, offsets - base, errors)
+        if len(at) >= 4 and span >= SPAN_OF_EXCHANGES:
+            skew = self._skew_of(at, offsets, [error - 0.9 * best + 1_000.0 for error in errors])
         # The longer the time seen, the better the skew is known; its error is that of the best exchange over that time.
-        seen = max(self._hull.span, at.max() - at.min(), SPAN_OF_A_HULL)
-        carried = offsets - base - skew * at
-        widened = errors + min(self._rate * SPAN_OF_A_HULL, errors.min()) / seen * np.abs(at)
-        middle = float(base + ((carried - widened).max() + (carried + widened).min()) / 2)
+        widening = min(self._rate * SPAN_OF_A_HULL, best) / max(self._hull.span, span, SPAN_OF_A_HULL)
+        low, high = -math.inf, math.inf
+        for moment, offset, error in zip(at, offsets, errors, strict=True):
+            carried, widened = offset - skew * moment, error + widening * abs(moment)
+            low, high = max(low, carried - widened), min(high, carried + widened)
+        middle = base + (low + high) / 2
         return (min(middle, edge) if self._hull.count else middle), skew
 
-    def _skew_of(self, at: NDArray[Any], offsets: NDArray[Any], errors: NDArray[Any]) -> float:
+    def _skew_of(self, at: list[float], offsets: list[float], doubts: list[float]) -> float:
         """Return the skew of a weighted line through exchanges, held within the drift."""
         # A round trip longer than the quickest one had a delay in one direction or the other: weak evidence.
-        weights = 1.0 / (errors - 0.9 * errors.min() + 1_000.0) ** 2
-        middle, level = np.average(at, weights=weights), np.average(offsets, weights=weights)
-        skew = float(np.sum(weights * (at - middle) * (offsets - level)) / np.sum(weights * (at - middle) ** 2))
+        weights = [1.0 / doubt**2 for doubt in doubts]
+        whole = sum(weights)
+        middle = sum(map(operator.mul, weights, at)) / whole
+        level = sum(map(operator.mul, weights, offsets)) / whole
+        apart = [moment - middle for moment in at]
+        pulls = list(map(operator.mul, weights, apart))
+        rise = sum(pull * (offset - level) for pull, offset in zip(pulls, offsets, strict=True))
+        skew: float = rise / sum(map(operator.mul, pulls, apart))
         return min(max(skew, -self._rate), self._rate)
 
     def _by_arrivals(self, tick: int) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from teds_provision.arrays import NDArray, np
 _LATE: Final = 2.0  # seconds by which samples may arrive late; beyond that, the clock was set back
 _MOST_FEW: Final = 1500  # bins; so many need two thirds of the memory of a ring with 6,000
 _TIDY: Final = 32  # bins between two removals of old ones
+_RARE: Final = 40  # bins with losses that are kept one by one; a row of all bins is smaller than more of them
 _FARTHEST: Final = 3e38  # largest distance between two values of a bin
 _REAL, _BITS = struct.Struct("<f"), struct.Struct("<I")
 
@@ -79,14 +80,28 @@ class Bins(SegmentedBins):
         counts = np.uint8 if coarse else np.uint16
         self._low = np.full(size, np.nan, np.float32)
         self._high = np.zeros(size, np.uint16) if coarse else np.full(size, np.nan, np.float32)
-        # Samples, invalid, lost; the last two are allocated only when first needed.
-        self._counts: list[NDArray[Any] | None] = [np.zeros(size, counts), *([None] * (1 if coarse else 2))]
         self._type, self._most = counts, int(np.iinfo(counts).max)
+        # Samples, invalid, lost; the last two are bins one by one while they are few.
+        self._counts: list[NDArray[Any] | dict[int, int]] = [
+            np.zeros(self.size, self._type),
+            *({} for _ in range(1 if coarse else 2)),
+        ]
         low, high = cast("Any", self._low), cast("Any", self._high)
         self._lows, self._highs = (
             cast("Any", memoryview(low)),
             cast("Any", memoryview(high)),
         )  # single numbers: a tenth of the time of indexing arrays
+
+    def _count_in(self, row: int, slot: int, more: int) -> None:
+        """Count in one slot."""
+        held = self._counts[row]
+        if isinstance(held, dict):
+            held[slot] = min(held.get(slot, 0) + more, self._most)
+            if len(held) > _RARE:
+                self._counts[row] = whole = np.zeros(self.size, self._type)
+                whole[list(held)] = list(held.values())
+        else:
+            held[slot] = min(int(held[slot]) + more, self._most)
 
     def add_one(self, number: int, value: float, invalid: int, lost: int, segment: int) -> None:
         """Take in one sample of a segment; ``value`` is NaN if there is none, ``invalid`` 1 if it is not valid."""
@@ -103,10 +118,7 @@ class Bins(SegmentedBins):
                     self._highs[slot] = value
         for row, more in enumerate((1, invalid, lost)[: len(self._counts)]):
             if more:
-                held = self._counts[row]
-                if held is None:
-                    held = self._counts[row] = np.zeros(self.size, self._type)
-                held[slot] = min(int(held[slot]) + more, self._most)
+                self._count_in(row, slot, more)
 
     def _widen(self, slot: int, value: float) -> None:
         """Let a coarse bin hold a value."""
@@ -139,9 +151,10 @@ class Bins(SegmentedBins):
         self._low[slots] = least
         for row, more in enumerate(counts[: len(self._counts), kept]):
             held = self._counts[row]
-            if held is None and more.any():
-                held = self._counts[row] = np.zeros(self.size, self._type)
-            if held is not None:
+            if isinstance(held, dict):
+                for place in np.flatnonzero(more).tolist():
+                    self._count_in(row, int(slots[place]), int(more[place]))
+            else:
                 held[slots] = np.minimum(held[slots].astype(np.int64) + more, self._most)
 
     def _forget(self, first: int, last: int) -> None:
@@ -156,10 +169,14 @@ class Bins(SegmentedBins):
             self._empty(slice(None, begin + count - self.size))
 
     def _empty(self, slots: slice) -> None:
+        emptied = range(*slots.indices(self.size))
         self._low[slots] = np.nan
         self._high[slots] = 0 if self.coarse else np.nan
         for held in self._counts:
-            if held is not None:
+            if isinstance(held, dict):
+                for slot in [slot for slot in held if slot in emptied] if held else ():
+                    del held[slot]
+            else:
                 held[slots] = 0
 
     def _high_of(self, slots: NDArray[Any]) -> NDArray[Any]:
@@ -179,12 +196,18 @@ class Bins(SegmentedBins):
         numbers = np.arange(max(first, self.newest - self.size + 1, 0), min(last, self.newest) + 1)
         slots = numbers % self.size
         nothing = np.zeros(len(slots), np.int64)
-        counts = np.stack([nothing if held is None else held[slots].astype(np.int64) for held in self._counts])
+        counts = np.stack([self._counted(held, slots) for held in self._counts])
         some = counts.any(axis=0)
         slots, counts = slots[some], counts[:, some]
         if self.coarse:
             counts = np.vstack([counts, nothing[some]])
         return numbers[some], self._low[slots], self._high_of(slots), counts
+
+    @staticmethod
+    def _counted(held: NDArray[Any] | dict[int, int], slots: NDArray[Any]) -> NDArray[Any]:
+        if isinstance(held, dict):
+            return np.array([held.get(slot, 0) for slot in slots.tolist()] if held else np.zeros(len(slots)), np.int64)
+        return np.asarray(held[slots], np.int64)
 
 
 class FewBins(SegmentedBins):

@@ -1376,6 +1376,13 @@ PATTERNS = (
         "tests/measure/sinks/test_live.py",
     ),
     Pattern(
+        "what was lost an hour ago is forgotten with its second",
+        "Bins._empty",
+        "slot in emptied",
+        "False",
+        "tests/ncap/test_past.py",
+    ),
+    Pattern(
         "a node that was given back is lent no more",
         "MeasurementJob.resume_node",
         "self.lent.discard(uuid)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -157,18 +158,34 @@ def test_a_channel_takes_less_than_a_hundred_thousand_octets() -> None:
     ramp(past, NOW - 70, 70)
     past.channel_history(NODE, 1)
     channel = past._channels[NODE, 1]
-    rings = [
-        ring for bins in (channel.hour, channel.ring(fine=True)) for ring in (bins._low, bins._high, *bins._counts)
-    ]
-    held = sum(ring.nbytes for ring in rings if ring is not None)
-    assert held <= 78_000, "nothing was lost, nothing invalid"
-    past.block(block(NOW, [[1.0]] * 100, index=9000, valid=[[False]] * 100))
+
+    def held() -> int:
+        rows = [
+            row for bins in (channel.hour, channel.ring(fine=True)) for row in (bins._low, bins._high, *bins._counts)
+        ]
+        return sum(sys.getsizeof(row) + 32 * len(row) if isinstance(row, dict) else row.nbytes for row in rows)
+
+    assert held() <= 78_300, "nothing was lost, nothing invalid"
+    past.block(block(NOW, [[1.0]] * 6000, index=9000, valid=[[False]] * 6000))
     past.channel_history(NODE, 1)
-    rings = [
-        ring for bins in (channel.hour, channel.ring(fine=True)) for ring in (bins._low, bins._high, *bins._counts)
-    ]
-    held = sum(ring.nbytes for ring in rings if ring is not None)
-    assert held <= 98_400
+    assert held() <= 98_400
+
+
+def test_what_is_rare_takes_no_row_of_the_hour_and_is_forgotten_with_its_second() -> None:
+    bins = Bins(1.0, HOUR, coarse=False)
+    for second in range(2 * HOUR):
+        bins.add_one(second, 1.0, int(second % 700 == 0), 2 * (second % 600 == 0), 0)
+    numbers, _, _, (_, invalid, lost) = bins.between(0, 2 * HOUR)
+    assert numbers[lost == 2].tolist() == list(range(3600, 7200, 600))
+    assert numbers[invalid == 1].tolist() == [4200, 4900, 5600, 6300, 7000]
+    assert lost.sum() + invalid.sum() == 12 + 5
+    assert all(isinstance(row, dict) for row in bins._counts[1:])
+    for second in range(2 * HOUR, 2 * HOUR + 100):  # a row of all is smaller from here on
+        bins.add_one(second, 1.0, 0, 1, 0)
+    numbers, _, _, (_, _, lost) = bins.between(0, 3 * HOUR)
+    assert isinstance(bins._counts[2], np.ndarray)
+    assert numbers[lost > 0].tolist() == [*range(4200, 7200, 600), *range(7200, 7300)]
+    assert lost.sum() == 5 * 2 + 100
 
 
 def test_no_bin_holds_values_of_two_calibrations() -> None:
