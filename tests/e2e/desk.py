@@ -7,7 +7,6 @@ import json
 import os
 import re
 import selectors
-import signal
 import sqlite3
 import subprocess
 import time
@@ -25,6 +24,7 @@ from teds_provision.node.node_template import create
 from teds_provision.station import station as base_station
 from tests.bench import PASSPHRASE
 from tests.cli.shell import PROGRAM, ROOT, Outcome, begin
+from tests.e2e.powered import PoweredNode
 from tests.firmware.c_node import CNode
 from tests.pace import PATIENCE, until
 from tests.places import free_bus, free_reader, new_uuid
@@ -211,34 +211,15 @@ class Desk:
 
 
 @dataclass
-class Node:
+class Node(PoweredNode):
     """A virtual transducer; its process lies on the desk's reader and hangs on its bus, as far as it is told to."""
-
-    desk: Desk
-    folder: Path
-    uuid: str
-    process: Running | None = None
 
     def start(self, *options: object, nfc: bool = True, can: bool = False, **more: Any) -> Node:
         """Power on, and wait until its links are up."""
         links = self.desk.links
         where = [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
-        self.process = self.desk.start("--json", "node", "run", self.folder, *where, *options, **more)
-        ready = self.process.wait_for_lines(1)[0]  # an actuator prints its state soon after
-        assert ready.get("ready") is True, ready
+        self.ready(self.desk.start("--json", "node", "run", self.folder, *where, *options, **more))
         return self
-
-    def stop(self) -> None:
-        """Take it away politely."""
-        assert self.process is not None
-        self.process.signal(signal.SIGTERM)
-        assert self.process.end().code == 0
-
-    def kill(self) -> None:
-        """Cut its power."""
-        assert self.process is not None
-        self.process.process.kill()
-        self.process.end()
 
     def missed(self) -> int:
         """How many messages of its streams it says that it could not send in time: its process had no processor."""
@@ -246,12 +227,6 @@ class Node:
         while self.process.read(0):
             pass
         return max(map(int, _NOT_IN_TIME.findall(self.process.out + self.process.err)), default=0)
-
-    def press(self) -> None:
-        """Hold its button, and wait until it is in factory state."""
-        assert self.process is not None
-        self.process.signal(signal.SIGUSR1)
-        until(lambda: self.flash["key"] is None)
 
     @property
     def octets(self) -> bytes:
@@ -262,11 +237,6 @@ class Node:
     def flash(self) -> dict[str, Any]:
         """What stands in its flash."""
         return dict(json.loads(self.octets)["flash"])
-
-    @property
-    def datasheet(self) -> dict[tuple[int, int], bytes]:
-        """Its TEDS by (channel, access code)."""
-        return {(channel, code): bytes.fromhex(teds) for channel, code, teds in self.flash["blocks"]}
 
 
 @dataclass

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
 from teds_provision.protocol.announce import default_can_address
+from tests.e2e.powered import PoweredNode
 from tests.firmware import builds
 from tests.firmware_images import public
-from tests.pace import until
-
-if TYPE_CHECKING:
-    from tests.e2e.desk import Desk, Running
 
 OFFERS: Final = frozenset({"nfc", "can", "reset by hand", "power cuts"})
 """What a test may need of a node and this one has. It has no Type 2 tag, no BLE, no slow chip, no trace, no battery, no
@@ -25,13 +21,9 @@ _KEYED, _PROVISIONED = 1, 2
 
 
 @dataclass
-class CNode:
+class CNode(PoweredNode):
     """A node in C; its flash is the file ``flash.bin`` in its folder. Members as those of ``tests.e2e.desk.Node``."""
 
-    desk: Desk
-    folder: Path
-    uuid: str
-    process: Running | None = None
     firmware: tuple[Path, Path] | None = None
 
     def start(self, *options: object, nfc: bool = True, can: bool = False, **more: Any) -> CNode:
@@ -46,28 +38,8 @@ class CNode:
             image, key = self.firmware
             words += ["--images", self.folder / "images", "--owner", public(key, "raw"), "--image", image]
             words += ["--security-counter"]
-        self.process = self.desk.start(*words, program=(str(builds.host()),), fork=False, **more)
-        ready = self.process.wait_for_lines(1)[0]  # an actuator prints its state soon after
-        assert ready.get("ready") is True, ready
+        self.ready(self.desk.start(*words, program=(str(builds.host()),), fork=False, **more))
         return self
-
-    def stop(self) -> None:
-        """Take it away politely."""
-        assert self.process is not None
-        self.process.signal(signal.SIGTERM)
-        assert self.process.end().code == 0
-
-    def kill(self) -> None:
-        """Cut its power."""
-        assert self.process is not None
-        self.process.process.kill()
-        self.process.end()
-
-    def press(self) -> None:
-        """Hold its button, and wait until it is in factory state."""
-        assert self.process is not None
-        self.process.signal(signal.SIGUSR1)
-        until(lambda: self.flash["key"] is None)
 
     @property
     def octets(self) -> bytes:
@@ -101,11 +73,6 @@ class CNode:
             "blocks": blocks,
             "read_only": [],
         }
-
-    @property
-    def datasheet(self) -> dict[tuple[int, int], bytes]:
-        """Its TEDS by (channel, access code)."""
-        return {(channel, code): bytes.fromhex(teds) for channel, code, teds in self.flash["blocks"]}
 
     def _slot(self, whole: bytes) -> bytes:
         slots = [whole[at : at + _SLOT] for at in (_IDENTITY, _IDENTITY + _SLOT)]

@@ -570,15 +570,20 @@ def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> No
     assert messages == ["This is not a board label: nonsense"]
 
 
+def evidence_by(member: Station, plant: Plant) -> codec.Evidence:
+    """Return the evidence of a board that this member builds and signs for a job of the plant."""
+    job = job_of(plant.north, registry=plant.roster.registry, stations={member.fingerprint: 3})
+    line, board = LineRun(member, take_job(member, job)), make_board(1)
+    member.unlock()
+    build(line, board)
+    (row,) = member.plant.line.evidence(uuid=board.uuid)
+    return codec.read(row.document)
+
+
 def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path) -> None:
     plant = Plant(tmp_path)
     west = plant.member("west", "line", "sign")
-    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
-    line, board = LineRun(west, take_job(west, job_of(plant.north, **members))), make_board(1)
-    west.unlock()
-    build(line, board)
-    (row,) = west.plant.line.evidence(uuid=board.uuid)
-    document = codec.read(row.document)
+    document = evidence_by(west, plant)
 
     def faults() -> list[str]:
         assert plant.north.plant.roster is not None
@@ -608,11 +613,7 @@ def test_what_a_station_signed_before_it_lost_that_role_may_be_good(
     """A file shows no page: only a station whose signatures never counted cannot have made a good one."""
     plant = Plant(tmp_path)
     west = plant.member("west", "line", "sign")
-    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
-    line, board = LineRun(west, take_job(west, job_of(plant.north, **members))), make_board(1)
-    west.unlock()
-    build(line, board)
-    (row,) = west.plant.line.evidence(uuid=board.uuid)
+    document = evidence_by(west, plant)
     roster = west.plant.roster
     assert roster is not None
     changed = tuple(
@@ -621,19 +622,14 @@ def test_what_a_station_signed_before_it_lost_that_role_may_be_good(
     )
     anchors = EvidenceAnchors(plant.north.identity.ca, roster=replace(roster, members=changed))
     lacks = "the station that signed the datasheet does not have the role 'sign'"
-    assert anchors.faults(codec.read(row.document)) == ([] if holds else [lacks])
+    assert anchors.faults(document) == ([] if holds else [lacks])
     plant.close()
 
 
 def test_evidence_of_a_line_whose_office_was_lost_does_not_hold_beside_a_roster(tmp_path: Path) -> None:
     plant = Plant(tmp_path)
     west = plant.member("west", "line", "sign")
-    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
-    line, board = LineRun(west, take_job(west, job_of(plant.north, **members))), make_board(1)
-    west.unlock()
-    build(line, board)
-    (row,) = west.plant.line.evidence(uuid=board.uuid)
-    made = codec.read(row.document)
+    made = evidence_by(west, plant)
     of_a_line = replace(made, facts=replace(made.facts, station=plant.north.fingerprint))  # west only signed for it
     roster = west.plant.roster
     assert roster is not None
