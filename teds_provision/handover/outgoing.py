@@ -20,7 +20,6 @@ from teds_provision.files import new_file, require_new
 from teds_provision.handover import gc_pause
 from teds_provision.handover.pending import OPEN, BundleNotes, content_digest
 from teds_provision.handover.trust import find_trusted
-from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_pieces
 from teds_provision.protocol.handover.envelope import EnvelopeWriter
 from teds_provision.protocol.handover.strict_json import time_text
@@ -118,7 +117,11 @@ class Selection:
 
     def _every(self) -> dict[bytes, str]:
         """Return every node with a held key and what keeps it here; if all stay, those of an interrupted move."""
-        why = {uuid: self._obstacle(uuid) for uuid in sorted(self.keys.keys() | self.pending)}
+        special = {*self.revoked, *self.tombstones, *self.due, *self.pending}
+        why = {
+            uuid: self._obstacle(uuid) if uuid in special else self.stays.get(uuid, _UNKNOWN)
+            for uuid in sorted(self.keys.keys() | self.pending)
+        }
         if all(why.values()):
             return self._cut_again() or why
         return why
@@ -191,18 +194,17 @@ def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[
     )
     stays: dict[bytes, str] = {}
     for chunk in known:
-        entries = station.pins.get_many([node.uuid for node in chunk])
-        pins = station.pins.pinned_among(chunk, entries.values())
-        stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in chunk}
+        elsewhere = station.pins.pinned_elsewhere(chunk)
+        stays |= {node.uuid: _why_node_stays(node, pinned_elsewhere=node.uuid in elsewhere) for node in chunk}
     return stays
 
 
-def _why_node_stays(node: NodeRecord | ExportEligibility, pin: str) -> str:
-    if (node.retired or "").startswith(OUT_OF_SERVICE):
+def _why_node_stays(node: NodeRecord | ExportEligibility, *, pinned_elsewhere: bool) -> str:
+    if node.retired is not None and node.retired.startswith(OUT_OF_SERVICE):
         return "it is out of service"
     if node.point is None:
         return _UNKNOWN
-    if not same_key(pin, fingerprint(node.point)):
+    if pinned_elsewhere:
         return "the key that it showed last is not the one that it is pinned to"
     return ""
 
@@ -517,21 +519,22 @@ def _bundled(station: Station, nodes: Iterable[LeavingNode]) -> Iterator[Bundled
     for chunk in chunks(nodes):
         uuids_of_chunk = [node.uuid for node in chunk]
         records = station.nodes.exported_many(uuids_of_chunk)
-        keys = {(key.uuid, key.key_id): key for key in station.keys.get_many(uuids_of_chunk)}
-        for leaving in chunk:
-            record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))
+        keys = station.keys.unwrap_named({node.uuid: node.key_id for node in chunk})
+        for uuid in uuids_of_chunk:
+            record, key = records.get(uuid), keys.get(uuid)
             if record is None or record.point is None or key is None:
-                raise PolicyError(f"Node {leaving.uuid.hex()} was changed in the meantime.", hint="Run it again.")
+                raise PolicyError(f"Node {uuid.hex()} was changed in the meantime.", hint="Run it again.")
+            epoch, octets = key
             yield BundledNode(
-                uuid=record.uuid,
-                node_key=record.point,
-                key=station.keys.unwrap(key),
-                epoch=key.epoch,
-                sequence=record.sequence,
-                profile=record.profile,
-                name=record.name,
-                groups=record.groups,
-                teds_sha256=record.teds_sha256,
+                uuid,
+                record.point,
+                octets,
+                epoch,
+                record.sequence,
+                record.profile,
+                record.name,
+                record.groups,
+                record.teds_sha256,
             )
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from operator import attrgetter
-from typing import Final
+from typing import Any, Final
 
 from teds_provision.protocol import keys
 from teds_provision.protocol.fingerprints import is_whole, same_key
@@ -21,7 +21,9 @@ from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 _values_but_mac = attrgetter(*(column.name for column in fields(WhitelistEntry) if column.name != "mac"))
-_bound = attrgetter("uuid", "fingerprint", "assurance", "name")
+_BOUND: Final = ("uuid", "fingerprint", "assurance", "name")
+_BOUND_COLUMNS: Final = ", ".join(_BOUND)
+_bound = attrgetter(*_BOUND)
 
 RECORD_AGAIN: Final = 600.0
 """Seconds in which a process records one wrong key of a UUID.
@@ -86,6 +88,27 @@ class Pins:
                     pins[entry.uuid] = _wholer(entry.fingerprint, seen)
         return pins
 
+    def pinned_elsewhere(self, nodes: Sequence[NodeRecord | ExportEligibility]) -> set[bytes]:
+        """Return those of a chunk of nodes that the whitelist pins to another key than the one they showed last.
+
+        No entries are made of the rows, as a handover asks for thousands.
+        """
+        statement, uuids = f"SELECT {_BOUND_COLUMNS}, mac FROM whitelist", [node.uuid for node in nodes]
+        pins: dict[bytes, str | None] = {}
+        for *values, mac in self._store.rows_of_nodes(statement, uuids):
+            self._check_values(tuple(values), mac)
+            pins[values[0]] = values[1]
+        elsewhere = set()
+        for node in nodes:
+            if node.point is not None:
+                self._nodes.check_point(node)
+                pin = pins.get(node.uuid)
+                if pin is not None:
+                    shown = keys.fingerprint(node.point)
+                    if pin != shown and not same_key(pin, shown):
+                        elsewhere.add(node.uuid)
+        return elsewhere
+
     def check(self, uuid: bytes, point: bytes) -> None:
         """Raise KeyMismatchError if this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
@@ -124,11 +147,14 @@ class Pins:
 
     def _checked(self, entry: WhitelistEntry) -> WhitelistEntry:
         """Return an entry; raise StoreChangedError if its MAC does not hold. Unchecked with a closed vault."""
-        if not self._row_macs.counts(entry.mac, "whitelist", _bound(entry)):
-            raise changed(
-                [f"the whitelist entry of {entry.uuid.hex()}"], "Remove it from the whitelist and add it again."
-            )
+        self._check_values(_bound(entry), entry.mac)
         return entry
+
+    def _check_values(self, values: tuple[Any, ...], mac: bytes | None) -> None:
+        if not self._row_macs.counts(mac, "whitelist", values):
+            raise changed(
+                [f"the whitelist entry of {values[0].hex()}"], "Remove it from the whitelist and add it again."
+            )
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
         """Return the whitelist entry of a node, None if it is not on it."""

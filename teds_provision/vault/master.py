@@ -23,6 +23,7 @@ _SECRET_OCTETS = 32
 _VERSION = 1
 _HEAD_OCTETS = 5
 _NONCE_OCTETS = 12
+_SEALED_AT = _HEAD_OCTETS + _NONCE_OCTETS
 _PREFIX = "teds1:"
 _DAMAGED = "Restore a backup of this station (teds-provision restore)."
 
@@ -64,7 +65,7 @@ class MasterKeys:
 
         Raises VaultError if it is damaged or moved, UnknownMasterKeyError if of another master key.
         """
-        head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:][:_NONCE_OCTETS], wrapped[17:]
+        head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:_SEALED_AT], wrapped[_SEALED_AT:]
         if len(sealed) < 16 or head[0] != _VERSION:
             raise VaultError("A wrapped key in the store is damaged.", hint=_DAMAGED)
         number = int.from_bytes(head[1:], "big")

@@ -208,7 +208,15 @@ class Database(Connection):
             return records
 
     def read_of_nodes(self, make: Callable[..., _Record], selection: str, uuids: Sequence[bytes]) -> list[_Record]:
-        """Make a record of every row of a chunk of nodes, by UUID; raises what :meth:`read` raises.
+        """Make a record of every row that :meth:`rows_of_nodes` returns; raises what :meth:`read` raises."""
+        rows = self.rows_of_nodes(selection, uuids)
+        try:
+            return [make(*row) for row in rows]
+        except (ValueError, TypeError, AttributeError) as error:
+            raise self._damaged() from error
+
+    def rows_of_nodes(self, selection: str, uuids: Sequence[bytes]) -> list[tuple[Any, ...]]:
+        """Return every row of a chunk of nodes, by UUID; raises StoreError.
 
         ``selection`` is a SELECT without a condition, its first column ``uuid`` that of an index. Of many nodes in a
         row, as in a handover, mostly all between the first and the last are asked for, or none is here: then one walk
@@ -220,11 +228,8 @@ class Database(Connection):
             statement = f"{selection} WHERE uuid BETWEEN ? AND ? ORDER BY uuid LIMIT ?"
             rows = self.execute(statement, (min(wanted), max(wanted), most))
             if len(rows) < most:  # otherwise the limit was reached: the range has many other nodes
-                try:
-                    return [make(*row) for row in rows if row[0] in wanted]
-                except (ValueError, TypeError, AttributeError) as error:
-                    raise self._damaged() from error
-        return self.read(make, f"{selection} WHERE uuid IN ({places(uuids)}) ORDER BY uuid", uuids)
+                return [row for row in rows if row[0] in wanted]
+        return self.execute(f"{selection} WHERE uuid IN ({places(uuids)}) ORDER BY uuid", uuids)
 
     def stream(self, make: Callable[..., _Record], statement: str, after: int = 0) -> Iterator[_Record]:
         """Make records a chunk at a time, holding no lock between chunks; raises StoreError.
