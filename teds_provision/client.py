@@ -128,7 +128,8 @@ class Client:
         self._connection: http.client.HTTPConnection | None = None
         self.etag: str | None = None
         """ETag of the last answer, None if it had none."""
-        self._read: dict[str, str] = {}  # the ETag of the last datasheet read, per node
+        self._read: dict[str, str] = {}  # the ETag of the last datasheet read, by UUID
+        self._uuids: dict[str, str] = {}  # the UUID of each node by the text under which it was read
 
     def __enter__(self) -> Client:
         return self
@@ -265,9 +266,9 @@ class Client:
         self._keep_tag(node, found["uuid"])
         return found
 
-    def _keep_tag(self, *names: str) -> None:
+    def _keep_tag(self, node: str, uuid: str) -> None:
         if self.etag is not None:
-            self._read |= dict.fromkeys(names, self.etag)
+            self._uuids[node], self._read[uuid] = uuid, self.etag
 
     def write_teds(
         self,
@@ -288,12 +289,12 @@ class Client:
         """
         query = "?dry_run=1" if dry_run else ""
         body = {"content": content, "accept_calibration": accept_calibration, "retype": retype}
-        tag = None if dry_run else self._read.get(node)
+        tag = None if dry_run else self._read.get(self._uuids.get(node, node))
         found: SheetPlan = self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", body, if_match=tag)
         if dry_run:
             self._keep_tag(node, found["uuid"])
         else:
-            self._read = {name: kept for name, kept in self._read.items() if name not in (node, found["uuid"])}
+            self._read.pop(found["uuid"], None)
         return found
 
     def provision(

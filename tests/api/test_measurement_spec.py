@@ -76,6 +76,10 @@ def test_a_body_becomes_the_settings_and_back() -> None:
         body, channels=list(body.channels), sinks=list(body.sinks)
     )
     assert MeasurementSpec.from_json(vars(bodies.NewMeasurement(group="arm")), dead_man=99).dead_man == 99
+    twice = {"uuids": ["ab" * 10, "cd" * 10, "AB" * 10], "channels": [2, 1, 2], "sinks": ["a.csv", "a.csv"]}
+    once = MeasurementSpec.from_json(twice)
+    assert [uuid.hex()[:2] for uuid in once.uuids] == ["ab", "cd"], "no node has two supervisors"
+    assert (once.channels, once.sinks) == ((2, 1), ("a.csv",))
 
 
 def test_the_command_has_an_option_for_each_setting_that_names_one() -> None:

@@ -47,6 +47,31 @@ def test_a_body_is_refused_if_and_only_if_its_published_schema_forbids_it(body: 
     assert taken == published
 
 
+@pytest.mark.parametrize(
+    ("body", "members", "fits"),
+    [
+        (bodies.NewMeasurement, {}, False),
+        (bodies.NewMeasurement, {"group": "arm"}, True),
+        (bodies.NewMeasurement, {"group": "arm", "match": None}, True),
+        (bodies.NewMeasurement, {"group": "arm", "match": "all"}, False),
+        (bodies.NewMeasurement, {"group": "arm", "uuids": []}, True),
+        (bodies.NewMeasurement, {"group": "arm", "uuids": ["arm"]}, False),
+        (bodies.NewMeasurement, {"uuids": []}, False),
+        (bodies.NewVirtual, {"name": "arm"}, False),
+        (bodies.NewVirtual, {"profile": "gripper"}, True),
+        (bodies.NewVirtual, {"profile": "gripper", "content": ""}, False),
+        (bodies.SetPoint, {}, False),
+        (bodies.SetPoint, {"value": 1.0, "hold": 0}, True),
+        (bodies.SetPoint, {"hold": 0.5}, False),
+    ],
+)
+def test_of_members_that_exclude_each_other_one_is_sent(body: type[Any], members: dict[str, Any], fits: bool) -> None:
+    """The property above rarely draws two that fit."""
+    assert jsonschema.Draft202012Validator(schema_of(body, {})).is_valid(members) == fits
+    with nullcontext() if fits else pytest.raises(BadRequestError):
+        read(body, json.dumps(members).encode())
+
+
 @pytest.mark.parametrize("match", ["", "a", "\u00e4" * 1000, "a" * 1001])
 def test_a_text_is_as_long_as_its_published_schema_lets_it_be(match: str) -> None:
     published = jsonschema.Draft202012Validator(schema_of(bodies.NewMeasurement, {})).is_valid({"match": match})

@@ -7,11 +7,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
 import pytest
 import yaml
 
+from teds_provision.describe import described_node as of_node
 from teds_provision.describe import ros2_control
 from teds_provision.describe.described_node import DescribedNode, MissingFieldError, described_node
 from teds_provision.describe.thing_description import thing_description
@@ -25,6 +27,8 @@ from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
 from teds_provision.teds.channel import Timing
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk
 from tests.cli.shell import call
@@ -210,6 +214,32 @@ def test_a_missing_field_is_named_with_its_profile_key_and_nothing_is_written(
 def test_a_hostile_nameplate_is_no_nameplate(station: Station, board: Board, tmp_path: Path) -> None:
     node = gripper(station, board, tmp_path, '<!DOCTYPE a [<!ENTITY b "c">]><a><OrderCode>&b;</OrderCode></a>')
     assert node.nameplate == {}
+
+
+def test_of_a_nameplate_in_several_languages_each_field_is_the_first_that_has_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    texts = (
+        b"<a><ManufacturerId>Example</ManufacturerId><OrderCode> </OrderCode></a>",
+        b"<a><b><SerialNo>42</SerialNo><OrderCode>GR-50</OrderCode></b></a>",
+        b"no XML",
+        b"<a><ManufacturerId>Beispiel</ManufacturerId><OrderCode>other</OrderCode><SerialNo>43</SerialNo></a>",
+    )
+    monkeypatch.setattr(of_node, "decode", lambda _octets: SimpleNamespace(text=texts))
+    image = Image(bytes(10), {(0, AccessCode.META_ID): b"any"})
+    assert of_node.nameplate_of(image) == {"manufacturerid": "Example", "ordercode": "GR-50", "serialno": "42"}
+    assert of_node.nameplate_of(Image(bytes(10), {})) == {}
+
+
+def test_a_node_is_described_under_the_stations_name_for_it_else_under_its_own(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    assert gripper(station, board, tmp_path).name == "hand"
+    station.nodes.remember(board.uuid, name="left hand")
+    assert described_node(station, board.uuid).name == "left hand"
+    station.nodes.remember(board.uuid, name=None)
+    node = described_node(station, board.uuid)
+    assert node.name == node.sheet.meta.name == "hand"
 
 
 def test_only_an_authentic_datasheet_is_described(station: Station, board: Board, tmp_path: Path) -> None:

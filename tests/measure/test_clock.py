@@ -15,7 +15,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.measure.clock import AT_FIRST, ClockMap, Exchange, MonotonicStamps, WallClock
+from teds_provision.measure.clock import (
+    AT_FIRST,
+    BUCKET,
+    STEP,
+    ClockMap,
+    Exchange,
+    HostClock,
+    LowerHull,
+    MonotonicStamps,
+    WallClock,
+)
 from teds_provision.measure.running.streams import NodeStreams
 from teds_provision.measure.verified_session import exchange_clock
 from teds_provision.protocol.operation.stream_commands import ClockReply
@@ -303,3 +313,27 @@ def test_exchanges_leave_nothing_in_the_cache_of_each_nodes_thread() -> None:
     """The fit of n exchanges took arrays of n numbers: blocks of each size stayed with each thread, 10 kB a node."""
     asked = subprocess.run([sys.executable, "-c", _MANY_THREADS], capture_output=True, check=True, text=True)
     assert int(asked.stdout) < 3000, "octets a thread"
+
+
+def test_of_another_streams_older_bucket_nothing_is_added_to_the_hull() -> None:
+    """A corner behind the last one would turn the hull, and with it the skew, upside down."""
+    hull = LowerHull()
+    assert hull.add_arrival(3 * BUCKET, 900)
+    assert not hull.add_arrival(3 * BUCKET + 1, 800), "the best of its bucket stands for it"
+    assert not hull.add_arrival(2 * BUCKET, 100)
+    assert hull.points() == [(3 * BUCKET + 1, 800)]
+    assert not hull.add_arrival(3 * BUCKET, 700), "a little older, and of the same bucket"
+    assert hull.points() == [(3 * BUCKET, 700)]
+
+
+def test_a_clock_that_is_followed_anew_is_apart_from_the_systems_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = WallClock(100.0)
+    monkeypatch.setattr(WallClock, "now", lambda _readings=9: now)
+    host = HostClock()
+    now = WallClock(100.0 + STEP / 2)
+    assert not host.was_set()
+    assert host.apart == pytest.approx(STEP / 2), "it belongs to the bound of each stamp"
+    now = WallClock(200.0)
+    assert host.was_set()
+    assert host.set_anew() == pytest.approx(100.0)
+    assert host.apart == 0.0

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -362,3 +363,15 @@ def test_all_values_are_calibrated_beforehand_only_for_a_stream_of_many_messages
         scene.heard.queue_message(scene.message(counter), scene.arrival(counter))
         scene.heard.finish()
     assert made == ([BLOCKS - 1] if quick else [])
+
+
+def test_of_a_batch_the_message_that_came_soonest_after_its_samples_is_told_to_the_clock() -> None:
+    """What waited on the link or in this process says less of the node's clock; of a batch with drops the last does."""
+    told: list[tuple[int, int]] = []
+    clock: Any = SimpleNamespace(arrival=lambda tick, at: told.append((tick, at)))
+    heard: Any = SimpleNamespace(clock=clock, _last_instant=30)
+    came = [(b"", 1_000), (b"", 1_090), (b"", 1_210)]
+    messages: Any = [SimpleNamespace(tick=tick) for tick in (500, 600, 700)]
+    ReceivedStream._note_arrival(heard, came, messages)
+    ReceivedStream._note_arrival(heard, came, messages[:2])
+    assert told == [(630, 1_090), (630, 1_210)]

@@ -293,3 +293,36 @@ def test_of_too_many_nodes_the_one_that_was_heard_longest_ago_is_forgotten() -> 
     for uuid in (*uuids[:MOST], uuids[0], uuids[MOST]):  # the first one answers again before one too many comes
         sightings.add_sighting(seen(uuid, 7))
     assert {sighting.uuid for sighting in sightings.all()} == {*uuids} - {uuids[1]}
+
+
+def test_a_node_is_missing_until_the_last_of_those_who_wait_for_it_has_gone() -> None:
+    sightings = Presence()
+    found = threading.Event()
+
+    def wait() -> None:
+        sightings.find(ONE, seconds=PATIENCE, stop=threading.Event())
+        found.set()
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    until(sightings.missing)
+    for _ in range(2):
+        with pytest.raises(NoNodeError):
+            find(sightings, ONE, seconds=0.0)
+        assert sightings.missing()
+    sightings.add_sighting(seen(ONE, 7))
+    waiting.join(PATIENCE)
+    assert found.is_set()
+    assert not sightings.missing()
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_two_places_the_one_that_answered_last_is_tried(order: tuple[int, int]) -> None:
+    sightings, now = Presence(), time.monotonic()
+    places = seen(ONE, 7, at=now - 5.0), seen(ONE, 9, place="can:y", at=now)
+    for place in order:
+        sightings.add_sighting(places[place])
+    assert find(sightings, ONE).address == 9
+    last = sightings.seen_at(ONE)
+    assert last is not None
+    assert (last.address, [sighting.address for sighting in sightings.all()]) == (9, [9])

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from teds_provision.errors import NoRoomError, UsageError
 from teds_provision.links.can.airtime import CanAirtime
+from teds_provision.measure import matching
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
-from teds_provision.measure.matching import NodeLoad, NodeMatch
-from teds_provision.measure.planning import BusShare, BusTime
+from teds_provision.measure.matching import NodeLoad, NodeMatch, load_of
+from teds_provision.measure.planning import BusShare, BusTime, plan_node
+from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.names import Topics
+from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
 
 
 def test_an_expression_is_terms_that_must_all_hold() -> None:
@@ -68,3 +74,24 @@ def test_a_node_costs_the_topics_its_values_and_two_messages_for_each_row() -> N
     assert NodeLoad(0.1, channels=3, rate=50.0).messages(10.0, rows=False) == 3 * 10, "MQTT carries no rows"
     assert issubclass(NoRoomError, Exception)
     assert NoRoomError("x").exit_code == 6
+
+
+def test_the_load_of_a_node_is_that_of_its_sensors_at_the_fastest_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    form = SampleForm(0, 2, 16)
+    every = [
+        Channel(1, kind=ChannelKind.SENSOR, sample=form, timing=Timing(period=0.01)),
+        Channel(2, kind=ChannelKind.SENSOR, sample=form, timing=Timing(period=0.1)),
+        Channel(3, kind=ChannelKind.ACTUATOR, sample=form, timing=Timing(period=0.001)),
+    ]
+    monkeypatch.setattr(matching, "Sheet", SimpleNamespace(from_image=lambda _image: SimpleNamespace(channels=every)))
+    stored: dict[bytes, Any] = {b"known": object()}
+    station: Any = SimpleNamespace(datasheets=SimpleNamespace(datasheet=stored.get))
+    time = BusTime(CanAirtime())
+    load = load_of(station, b"known", MeasurementRequest(), time)
+    assert (load.channels, load.rate) == (2, 100.0)
+    assert load.bus == pytest.approx(plan_node(every[:2], time).load)
+    slower = load_of(station, b"known", MeasurementRequest(rate=20.0), time)
+    assert slower.rate == 20.0, "and the slow one at its own"
+    assert load_of(station, b"unknown", MeasurementRequest(), time) == NodeLoad()
+    every.clear()
+    assert load_of(station, b"known", MeasurementRequest(), time) == NodeLoad(), "its session will show it"

@@ -8,11 +8,12 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import GarbledError
+from teds_provision.errors import GarbledError, PolicyError
 from teds_provision.measure import node_supervisor
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.clock import HostClock
 from teds_provision.measure.node_supervisor import LOOK, NodeSupervisor
+from teds_provision.measure.planning import BusShare
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.measurement_job import MeasurementJob
@@ -128,3 +129,82 @@ def test_a_node_that_was_given_back_is_lent_no_more() -> None:
     assert job.lent == {UUID}
     job.resume_node(UUID)
     assert job.lent == set()
+
+
+def test_on_a_bus_that_has_grown_a_node_gets_a_longer_lease_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each Operate costs the bus what the longer lease saves; and a lease never shrinks in a session."""
+    now, claimed = [0.0], list[tuple[int, int]]()
+    supervisor = supervisor_at(now, monkeypatch, lease=10)
+    nodes = {0.25: 10, 20.25: 90, 60.25: 400, 120.25: 5}
+    share = SimpleNamespace(nodes=10)
+    supervisor.bus = cast(Any, SimpleNamespace(share=share))
+    supervisor._claimed = [1, 2]
+    monkeypatch.setattr(node_supervisor, "claim", lambda _trusted, number, *, lease: claimed.append((number, lease)))
+    streams = SimpleNamespace(tell_time=lambda _trusted: None, silent=lambda _now: 0.0, clock=SimpleNamespace(lie=""))
+    monkeypatch.setattr(supervisor, "streams", streams)
+
+    def require() -> None:
+        now[0] += 0.25
+        share.nodes = nodes.get(now[0], share.nodes)
+        if now[0] >= 200.0:
+            supervisor.stop()
+
+    none: Any = None
+    supervisor._watch(none, none, cast(Any, SimpleNamespace(require=require, mark="")), None)
+    assert claimed == [(1, 18), (2, 18), (1, 60), (2, 60)]
+
+
+def test_a_node_that_is_on_another_bus_now_leaves_its_room_on_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    here, other = (SimpleNamespace(share=BusShare(cast(Any, None))) for _ in range(2))
+    for bus in (here, other):
+        bus.share.taken[UUID] = 0.2
+    supervisor = supervisor_at([100.0], monkeypatch)
+    presence = SimpleNamespace(find=lambda _uuid, **_how: None)
+    buses = SimpleNamespace(presence=presence, bus_of=lambda _sighting: here, all=lambda: [here, other])
+    monkeypatch.setattr(supervisor, "_buses", buses)
+    for step in ("_let_others_finish", "_wait_for_vault"):
+        monkeypatch.setattr(supervisor, step, lambda: None)
+    monkeypatch.setattr(supervisor, "_in_session", lambda *_words: None)
+    standing = SimpleNamespace(require_measurable=lambda: None)
+    monkeypatch.setattr(node_supervisor, "NodeStanding", lambda _station, _uuid: standing)
+    supervisor._try_once()
+    assert (here.share.taken, other.share.taken) == ({UUID: 0.2}, {})
+
+
+def test_a_node_that_begins_again_has_neither_its_error_nor_its_end_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    reports, tries = list[NodeReport](), list[bool]()
+    events = Events(lambda _block: None, lambda _facts: None, reports.append)
+    buses: Any = SimpleNamespace(all=list)
+    none: Any = None
+    made = NodeSupervisor(none, buses, UUID, MeasurementRequest(), HostClock(), events, CommonStart([UUID]))
+
+    def try_once() -> None:
+        tries.append(made.done.is_set())
+        if len(tries) == 1:
+            raise PolicyError("It is revoked.")
+
+    monkeypatch.setattr(made, "_try_once", try_once)
+    made.stop("renamed", comes_back=True)
+    for _ in range(2):
+        made.start()
+        made.join(60)
+    made.start()
+    made.join(60)
+    assert tries == [False, False]
+    assert (made.error, made.done.is_set()) == (None, True)
+    assert [(report.state, report.why) for report in reports] == [
+        ("ended", "renamed"), ("refused", "It is revoked"), ("ended", ""),
+    ]  # fmt: skip
+
+
+def test_the_end_of_a_measurement_is_stored_with_its_first_value_and_not_moved_by_a_restart() -> None:
+    station: Any = None
+    job = MeasurementJob(station, KeptMeasurement("", uuids=(UUID,)))
+    job._began(None)
+    assert job.kept.ends is None
+    job._began(600.0)
+    ends = job.kept.ends
+    assert ends is not None
+    assert ends == pytest.approx(time.time() + 600.0, abs=60.0)
+    job._began(5.0)
+    assert job.kept.ends == ends

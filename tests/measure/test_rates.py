@@ -20,6 +20,7 @@ from teds_provision.measure.rates import (
     rounded_down,
 )
 from teds_provision.measure.request import MeasurementRequest
+from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.station.station import Station
 from tests.bench import make_station
 from tests.e2e.desk import ANGLE
@@ -76,6 +77,17 @@ def test_what_is_slowest_decides(station: tuple[Station, bytes, bytes]) -> None:
     assert taken.rate < narrow.rate, "others use the bus too"
     topics = proposed(station, replace(idle, budget=1_000, rows=True), 1)
     assert (topics.limit, topics.rate) == ("budget", 200), "two messages a row, and 10 a second of the channel"
+
+
+def test_what_others_have_of_a_bus_counts_once_for_all_nodes_on_it(station: tuple[Station, bytes, bytes]) -> None:
+    where = {station[1]: "can0", station[2]: "can0"}
+    beside = BusTime(CanAirtime(50_000), taken=MOST_LOAD / 2)
+    around = Surroundings(lambda uuid: (where[uuid], beside), values=HIGH)
+    together = proposed(station, around, 1, 2)
+    where[station[1]] = "can1"
+    apart = proposed(station, around, 1, 2)
+    assert (together.limit, apart.limit) == ("bus", "bus")
+    assert together.rate < apart.rate
 
 
 def test_one_rate_for_all_is_no_faster_than_the_slowest_channel(station: tuple[Station, bytes, bytes]) -> None:

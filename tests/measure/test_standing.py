@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from teds_provision.errors import BadDatasheetError, PolicyError, TedsProvisionError
+from teds_provision.errors import BadDatasheetError, KeyStolenError, PolicyError, TedsProvisionError
+from teds_provision.measure import standing as of_standing
 from teds_provision.measure.standing import NodeStanding, require_measurable
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.station.station import Station
@@ -115,3 +119,20 @@ def test_in_transparent_mode_a_node_off_the_whitelist_is_measured_on_and_not_mov
     pair.north.nodes.remember(pair.board.uuid, name="another")  # any change of the store is looked at
     with pytest.raises(PolicyError, match="actuators are not moved"):
         driven.require()
+
+
+def test_a_key_that_was_stolen_ends_a_session_that_was_opened_before_and_again_after_it_was_rotated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The session under the key that is known as stolen was opened all the same; each later theft ends one."""
+    stolen: list[str | None] = ["out of a backup"]
+    station: Any = SimpleNamespace(changes=lambda: len(stolen), keys=SimpleNamespace(stolen=lambda _uuid: stolen[-1]))
+    monkeypatch.setattr(of_standing, "require_measurable", lambda _station, _uuid: None)
+    monkeypatch.setattr(of_standing, "verdict_of", lambda _station, _uuid: None)
+    monkeypatch.setattr(of_standing, "SETTLING", 0.0)
+    standing = NodeStanding(station, bytes(10))
+    for why, ends in (("out of a backup", False), ("another", True), (None, False), ("out of a backup", True)):
+        stolen.append(why)
+        with pytest.raises(KeyStolenError) if ends else nullcontext():
+            standing.require()
+        assert standing.ended is None, "the next session is under a new key"

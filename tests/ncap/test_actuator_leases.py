@@ -12,6 +12,7 @@ import pytest
 
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.ncap.nodes import actuator_leases
 from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases, Measured, _HeldActuator, _SetPointOrder
 
 
@@ -108,3 +109,42 @@ def test_the_session_of_a_nodes_actuators_ends_with_the_last_of_them() -> None:
         with first("ab") as session:
             assert session is the_session
     assert ended == ["ab"]
+
+
+def test_a_set_point_whose_time_is_shorter_than_the_way_to_the_node_is_applied_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else a short hold on a busy bus is answered, or given up, without a move."""
+    standing = SimpleNamespace(require=lambda: None, drives=False)
+    monkeypatch.setattr(actuator_leases, "NodeStanding", lambda _station, _uuid: standing)
+    applied: list[float] = []
+
+    class Actuator:
+        pause, safe = 0.1, True
+
+        def apply(self, value: float) -> Any:
+            applied.append(value)
+            return SimpleNamespace(as_json=lambda: {"value": value, "unit": "m"})
+
+        def __exit__(self, *_: object) -> None:
+            applied.append(-1.0)
+
+    class Leases(ActuatorLeases):
+        def _claimed(self, *_words: Any, again: bool) -> Any:
+            return Actuator()
+
+        @staticmethod
+        def _until_news(held: _HeldActuator, answered: int, pause: float) -> None:
+            if answered == 1:  # another request comes as the time is over
+                held.order = _SetPointOrder(0.75, None, 2)
+
+    @contextmanager
+    def session(_uuid: str) -> Iterator[VerifiedSession | None]:
+        yield cast(Any, object())
+
+    none = cast(Any, None)
+    leases = Leases(none, cast(Any, Events()), none, none, none, none, none)
+    held = _HeldActuator("ab", 1, time.monotonic() - 1.0, _SetPointOrder(0.5, None, 1))
+    leases._hold(held, session)
+    assert applied == [0.5, 0.75, -1.0]
+    assert (held.answered, held.let_go, held.safe, standing.drives) == (2, True, True, True)

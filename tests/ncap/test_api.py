@@ -414,6 +414,7 @@ def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:
     names = asked.request("PUT", "/names", row)["names"]
     assert {"uuid": hand, "channel": 2, "name": "left/opening", "topic": "/left/opening"} in names
     assert asked.node(hand)["channels"][1]["topic"] == "/left/opening"
+    assert asked.request("PUT", "/names", row)["names"] == names, "its own name is no other channel's"
     refused(asked, 422, "usage", "PUT", "/names", {**row, "channel": 3})
     refused(asked, 422, "usage", "PUT", "/names", {**row, "name": "1/2"})
     assert "Channels in its datasheet: 1, 2, 3" in refused(

@@ -105,3 +105,21 @@ def test_wrong_tokens_of_more_than_a_minute_ago_count_no_more(tmp_path: Path, mo
         guard._wrong.clear()
         guard._wrong.extend([time.monotonic() - ago] * 10)
         assert status_of(guard, wrong) == status
+
+
+def test_who_waits_for_a_refusal_gives_the_place_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else wrong tokens would be slowed down fifty times, and never again until the service ends."""
+    monkeypatch.setattr("teds_provision.ncap.web.guard._SLOWED", 0.0)
+    monkeypatch.setattr("teds_provision.ncap.web.guard._MOST_SLOWED", 1)
+    guard = Guard(app, Tokens(tmp_path), front((), PORT, tls=False))
+    guard._wrong.extend([time.monotonic()] * 10)
+    slept: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        assert guard._slowed == 1
+        slept.append(seconds)
+
+    monkeypatch.setattr("teds_provision.ncap.web.guard.asyncio.sleep", sleep)
+    for _ in range(3):
+        assert status_of(guard, {"host": HERE, "authorization": "Bearer nonsense"}) == 429
+    assert slept == [0.0] * 3

@@ -77,6 +77,35 @@ def test_what_is_known_of_a_channel_decides_whether_its_line_wraps() -> None:
     assert given_out() == [6.0, 6.2, 0.1, 0.3]
 
 
+def test_a_channel_has_raw_numbers_only_as_long_as_it_has_no_calibration() -> None:
+    angle, force = (ChannelFacts("ab" * 10, "", number, "") for number in (1, 2))
+    live = Live()
+    live.join()
+
+    def given_out() -> list[list[float | None]]:
+        two = replace(block(0, 1, 0.01, 2), value=np.array([[1.5, 2.5]]), raw=np.array([[7, 8]]))
+        live.block(two)
+        return [numbers for _, numbers in live._gather(1.0).values()]
+
+    live.learn([angle, force], {angle.key, force.key})
+    assert given_out() == [[7.0], [8.0]]
+    live.learn([angle])
+    assert given_out() == [[1.5], [8.0]], "calibrated meanwhile; of the other channel nothing is new"
+    live.learn([angle], {force.key})
+    assert given_out() == [[1.5], [8.0]]
+
+
+def test_after_a_silence_no_more_points_come_at_once_than_in_a_fifth_of_a_second() -> None:
+    live = Live()
+    live.join()
+    live.block(block(0, 1, 0.001))
+    live._gather(0.05)
+    assert live._gather(3600.0) == {}
+    live.block(block(1, 200, 0.001))
+    [(times, _)] = live._gather(0.05).values()
+    assert 10 <= len(times) <= POINTS / 5
+
+
 def block(first: int, count: int, period: float, channels: int = 1) -> Block:
     rows = np.arange(first, first + count)
     values = np.repeat(np.sin(rows * 0.1)[:, None], channels, axis=1)

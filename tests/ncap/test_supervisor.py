@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from starlette.responses import StreamingResponse
 from teds_provision import client
 from teds_provision.errors import NodeBusyError, NoNodeError, StoreError
 from teds_provision.links.discovery import Sighting
+from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.buses import Buses
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, NodeLoan
@@ -23,12 +25,13 @@ from teds_provision.ncap.membership import Member, Membership
 from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
-from teds_provision.ncap.running_measurement import RunningMeasurement
+from teds_provision.ncap.running_measurement import Phase, RunningMeasurement
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web import resources as web
 from teds_provision.ncap.web.guard import CALLER
 from teds_provision.ncap.web.resources import Resources
 from teds_provision.station.station import Station
+from teds_provision.station.store.audit import AuditEntry, AuditFilter
 from teds_provision.station.store.records import KeptMeasurement, WhitelistEntry
 from tests.bench import make_station
 from tests.ncap.short_waits import SHORT
@@ -231,3 +234,50 @@ def test_a_node_that_had_just_arrived_when_a_measurement_ends_is_given_back(serv
     running.membership.arrive(NODE, 0.0)
     service.measurements._finish(running)
     assert service.locks.holder(NODE) is None
+
+
+def listed(service: Service, *uuids: str) -> RunningMeasurement:
+    """Return a measurement of these nodes that is in the table and does nothing: its phase says that it is over."""
+    kept = KeptMeasurement("1", uuids=tuple(map(bytes.fromhex, uuids)))
+    running = RunningMeasurement(kept, service.measurements._listed(kept), kept, phase=Phase.OVER)
+    running.over.set()
+    service.measurements._running["1"] = running
+    return running
+
+
+def entries(service: Service, act: str) -> list[AuditEntry]:
+    return list(service.station.audit_log.chosen(AuditFilter(act=act)))
+
+
+def test_a_writer_that_is_gone_before_its_turn_gets_no_node(service: Service) -> None:
+    """Its loan would last until the service ends, and the node would be measured no more."""
+    loan = NodeLoan(NODE, "let go for write")
+    service.measurements.return_node(loan)
+    assert service.measurements.lend_node(loan) is False
+    assert service.measurements.lent_for(NODE) is None
+
+
+def test_the_first_value_of_a_node_is_in_the_log_once_and_its_returns_are_events(service: Service) -> None:
+    running, seen = listed(service, NODE), list[str]()
+    service.live.on_event = lambda event: seen.append(event["state"]) if event["event"] == "measurement" else None
+    for state in ("running", "lost", "running", "lost", "running"):
+        service.measurements._report(running, NodeReport(NODE, state, samples=3))
+    assert [entry.outcome for entry in entries(service, "measure")] == ["joined"]
+    assert [state for state in seen if state in ("joined", "left")] == ["joined", "left", "joined", "left", "joined"]
+
+
+def test_a_measurement_with_other_nodes_shows_no_reports_of_those_that_it_had(service: Service) -> None:
+    running = listed(service, NODE, OTHER)
+    running.reports = {NODE: {"state": "lost"}, OTHER: {"state": "running"}}
+    service.measurements._set_members(running, replace(running.kept, uuids=(bytes.fromhex(OTHER),)))
+    assert running.uuids == (OTHER,)
+    assert running.reports == {OTHER: {"state": "running"}}
+
+
+def test_the_log_has_what_a_deleted_measurement_counted(service: Service) -> None:
+    running = listed(service, NODE, OTHER)
+    for node in (NODE, OTHER):
+        service.measurements._report(running, NodeReport(node, "running", samples=40, lost=2))
+    service.measurements.delete("1")
+    *_, ended = entries(service, "measure")
+    assert (ended.outcome, ended.detail) == ("ended", {"id": "1", "owner": "ncap", "samples": 80, "lost": 4})

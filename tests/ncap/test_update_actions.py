@@ -10,8 +10,15 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import LinkError, StoreError
-from teds_provision.ncap.nodes import updates
-from teds_provision.ncap.nodes.update_actions import FOLDER, KEPT, BoardRow, UpdateAction, UpdateRequest
+from teds_provision.ncap.nodes import update_actions, updates
+from teds_provision.ncap.nodes.update_actions import (
+    FOLDER,
+    KEPT,
+    BoardRow,
+    UpdateAction,
+    UpdateFolder,
+    UpdateRequest,
+)
 from teds_provision.ncap.nodes.updates import Updates
 
 NODE = "ab" * 10
@@ -73,3 +80,29 @@ def test_an_update_that_runs_learns_that_the_service_ends(tmp_path: Path, monkey
     action = UpdateAction("00", UpdateRequest((NODE,)), {"version": "1.1.0"}, {NODE: row}, "a person", None, 0.0)
     assert made._update(action, image, NODE).result == "lost"
     assert ends == [False, True]
+
+
+def test_the_image_of_an_update_is_on_the_disk_before_its_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed in between, the other way round, the next start would find an update that it cannot go on with."""
+    written: list[str] = []
+    monkeypatch.setattr(update_actions, "write_whole", lambda path, _octets: written.append(path.name))
+    action = UpdateAction("a1", UpdateRequest((NODE,)), {"version": "1.1.0"}, {}, "a person", None, 0.0)
+    UpdateFolder(tmp_path).keep_new(action, b"image")
+    assert written == ["a1.image", "a1.json"]
+
+
+def test_boards_that_a_cancel_left_out_stay_so_after_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / FOLDER).mkdir(mode=0o700)
+    made, dropped = updates_of(tmp_path), list[bool]()
+    monkeypatch.setattr(made, "_live", SimpleNamespace(event=lambda *_words, **_facts: None))
+    rows = {
+        node: BoardRow(node, state=state) for node, state in (("ab", "running"), ("cd", "waiting"), ("ef", "ended"))
+    }
+    made._actions["a1"] = UpdateAction("a1", UpdateRequest(tuple(rows)), {"version": "1"}, rows, "page", None, 0.0)
+    made._work = cast(Any, SimpleNamespace(drop_waiting=lambda: dropped.append(True)))
+    made.cancel("a1")
+    [kept] = UpdateFolder(tmp_path).read()
+    assert [row.state for row in kept.rows.values()] == ["running", "skipped", "ended"]
+    assert dropped == [True]

@@ -312,3 +312,30 @@ def test_a_reader_that_two_commands_borrowed_is_lent_until_both_gave_it_back(wat
     assert watch._borrowers == {id(second)}
     watch.give_back(second)
     assert watch._borrowers == set()
+
+
+def test_a_node_whose_state_or_address_changed_is_looked_at_anew(watch: LinkWatch) -> None:
+    """One that was reset, or provisioned by a command of this machine, is another one to who adopts or measures."""
+    looked: list[str] = []
+    watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.state.name))  # type: ignore[assignment]
+
+    provisioned, factory = (SimpleNamespace(name=name) for name in ("PROVISIONED", "FACTORY"))
+    for address, state in ((3, factory), (3, factory), (3, provisioned), (3, provisioned), (4, provisioned)):
+        again = sighting(3)
+        again.address, again.identity.state = address, state
+        watch.on_sighting(again)
+        watch._pending.clear()
+    assert looked == ["FACTORY", "PROVISIONED", "PROVISIONED"]
+
+
+def test_of_a_reader_that_is_lost_nothing_is_there_any_more(watch: LinkWatch) -> None:
+    uuid = sighting(5).uuid.hex()
+    watch.on_sighting(sighting(5))
+    watch._directory.note("cd" * 10, "came", place="can:y", present=True)
+    watch._directory.stranger(watch.place, "ab" * 10, there=True)
+    watch._notice(Notice("reader-lost", "The reader was pulled."))
+    assert (watch.state.state, present(watch), watch._directory.strangers(watch.place)) == ("down", 0, 0)
+    assert not watch._directory.seen(uuid).present
+    assert watch._directory.seen("cd" * 10).present
+    watch._notice(Notice("reader-ready", "The reader is back."))
+    assert (watch.state.state, watch.state.problem) == ("up", None)

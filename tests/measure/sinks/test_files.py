@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import os
@@ -28,6 +29,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError, TedsProvisionError, UsageError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
 from teds_provision.measure.sinks.mcap.recover import recover
 from teds_provision.measure.sinks.mcap.writer import MAGIC
@@ -627,3 +629,25 @@ def test_a_number_sign_in_a_name_begins_no_comment(tmp_path: Path, suffix: str) 
     [first, *_] = rows(path.read_text(), "," if suffix == "csv" else "\t")
     assert first["arm #2/motor #1 [rad]"] == "0.1"
     assert first["arm #2/motor #1 raw"] == "1"
+
+
+def test_of_what_a_full_disk_took_in_part_the_whole_pieces_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part, write = Part(tmp_path / "run.csv"), os.write
+    part.add(b"head\n")
+    part.flush()
+    for piece in (b"one\n", b"two\n", b"three\n"):
+        part.add(piece, 2)
+
+    def full(file: int, octets: bytes) -> int:
+        if len(octets) <= len(b"wo\nthree\n"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(file, octets[:5])
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(OSError, match="No space"):
+        part.flush()
+    assert ((tmp_path / "run.csv").read_bytes(), part.size) == (b"head\none\n", 9)
+    part.add(b"four\n", 3)
+    assert part.abandon() == 7, "what was cut off, and what waits"
