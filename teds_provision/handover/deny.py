@@ -40,6 +40,8 @@ def deny(station: Station, statement: Statement, *, key: str | None) -> None:
         entry = RevocationRecord(statement.uuid, named, statement.why, statement.statement, created)
         station.policy.deny(entry)
         station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
+        if station.plant.joined is not None:  # a page may have lifted it before it came
+            station.plant.claims.queue([statement.uuid])
 
 
 def deny_all(station: Station, statements: tuple[Statement, ...], bundle: Bundle) -> None:

@@ -216,6 +216,7 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
     known = station.plant.claims.known_ids(chain.id, [_number(stated.id) for stated in events])
     by_node: dict[bytes, list[Event]] = {}
     digests: list[tuple[bytes, int, bool]] = []
+    lifted: set[str] = set()
     for stated in events:
         number = _number(stated.id)
         if number in known:
@@ -227,11 +228,16 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
             digests.append((bytes.fromhex(digest), n, stated.act == "vouched"))
         elif stated.act == "lifted":
             station.plant.claims.put_lifting(stated.members["of"], chain)
+            lifted.add(stated.members["of"])
         if stated.uuid is not None:
             by_node.setdefault(stated.uuid, []).append(stated)
     station.plant.claims.add_ids(chain.id, known)
     station.plant.claims.put_digests(chain, digests)
     _keep_bans(station, chain, events, counts=True)
+    if lifted:  # a ban that came in a bundle is in no page, so that only the deny list shows which node it is of
+        station.plant.claims.queue(
+            ban.uuid for ban in station.policy.revocations() if event.hash_of_statement(ban.statement) in lifted
+        )
     there = station.plant.claims.of_station(chain.id, list(by_node))
     claims: dict[bytes, str] = {}
     for uuid, statements in by_node.items():

@@ -19,9 +19,13 @@ from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.plant.roster import Share
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.line import SignRequestRow
-from teds_provision.station.plant.parcels import ParcelRow
+from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import WhitelistEntry, utc_now
+from tests.bench import Board, talk
 from tests.cli.shell import call
 from tests.plant.handing import Plant, board_of
 
@@ -56,6 +60,13 @@ def holds(station: Station, uuid: bytes) -> list[tuple[int, str]]:
 
 def waits(station: Station) -> list[str]:
     return [row.detail for row in station.plant.parcels.all("in", "waiting")]
+
+
+def rotated(station: Station, board: Board) -> None:
+    """The station takes the board over at a tap, or makes a new key with it."""
+    with talk(board) as node:
+        who = identify(station, node)
+        agree(station, node, who, rotate=True, newcomer=WhitelistEntry(node.uuid, who.fingerprint, utc_now(), "tap"))
 
 
 def test_a_key_goes_to_who_shares_it_and_its_receipt_comes_back(plant: Plant) -> None:
@@ -127,6 +138,46 @@ def test_a_copy_that_expired_while_it_waited_makes_room_for_the_next_one(plant: 
     assert len(waits(plant["south"])) == 1
     sync(plant, "south", at=now(8))
     assert waits(plant["south"]) == []
+
+
+def test_an_order_that_is_given_again_is_the_same_parcel_until_that_has_expired(plant: Plant) -> None:
+    plant.roster(ROLES)
+    station = plant["west"]
+    order = outgoing.ExportOrder(("south",), (board_of(station, os.urandom(10)).uuid,))
+
+    def send(at: datetime) -> str:
+        with station.lock("test"):
+            return parcels.send_export(station, outgoing.plan_export(station, order, at), at)
+
+    first = send(now())
+    assert send(now()) == send(now(6)) == first
+    assert send(now(8)) != first
+
+
+def test_a_key_of_one_sender_that_was_never_proven_keeps_no_other_senders_key_out(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "north", "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west", "south")
+    rotated(plant["north"], board)
+    sync(plant, "north", "south")
+    assert holds(plant["south"], board.uuid) == [(2, "import"), (1, "import")]
+    rotated(plant["west"], board)
+    sync(plant, "west", "south")
+    assert holds(plant["south"], board.uuid) == [(2, "import"), (1, "import")]
+    assert waits(plant["south"]) == [f"{board.uuid.hex()}: a key of it from this sender was never proven"]
+
+
+def test_only_what_a_line_would_send_again_is_dropped_for_its_age(plant: Plant) -> None:
+    plant.roster(ROLES)
+    west, peer = plant["west"], plant["north"].fingerprint
+    kinds: tuple[ParcelKind, ...] = ("sign-request", "signed", "job")
+    with west.transaction():
+        for kind in kinds:
+            west.plant.parcels.put(ParcelRow(f"{kind} 1", "in", peer, kind, "waiting", "", kind), b"a document")
+    sync(plant, "west", at=now(30))
+    assert len(parcels.received(west, "signed")) == len(parcels.received(west, "sign-request")) == 1
+    sync(plant, "west", at=now(32))
+    assert [kind for kind in kinds if parcels.received(west, kind)] == ["job"]
 
 
 def test_abandoned_requests_do_not_keep_jobs_out(plant: Plant) -> None:

@@ -13,11 +13,14 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import ForkError, LinkError, NotMemberError, PolicyError, StoreLockedError
+from teds_provision.handover import deny
 from teds_provision.plant.apply_pages import heads_digest, merged_views
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import resume, sync
 from teds_provision.plant.transport import CarriedPage
+from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.plant.document import hash_of
+from teds_provision.protocol.plant.event import hash_of_statement
 from teds_provision.protocol.plant.page import PageDraft, sign_page
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
@@ -76,6 +79,47 @@ def test_a_pin_of_ones_own_stays_whatever_a_keeper_says(plants: Plant) -> None:
     assert entry is not None
     assert entry.fingerprint == "cd" * 32
     assert [name for _, name, _ in south.plant.claims.conflicts(UUID)] == ["other pin"]
+
+
+@pytest.mark.parametrize(("who", "ends"), [("north", True), ("west", True), ("east", False)])
+def test_a_ban_out_of_a_bundle_ends_where_a_keeper_or_its_signer_lifts_it(plants: Plant, who: str, ends: bool) -> None:
+    south = plants.member("south", "base")
+    stations = {"north": plants.north, "west": plants.member("west", "line"), "east": plants.member("east", "base")}
+    stations["west"].unlock()
+    ban = seal_revocation(stations["west"].vault.identity(), uuid=UUID, node=KEY, why="lost", created=datetime.now(UTC))
+    with south.transaction():
+        deny.deny(south, ban, key=None)
+    plants.round()
+    assert south.policy.revocation(UUID) is not None, "no page has it"
+    stations[who].plant.record_event("lifted", None, of=hash_of_statement(ban.statement))
+    plants.round()
+    assert (south.policy.revocation(UUID) is None) == ends
+    with south.transaction():
+        deny.deny(south, ban, key=None)
+    plants.sync(south)
+    assert (south.policy.revocation(UUID) is None) == ends, "a later bundle brings it once more"
+
+
+def test_a_ban_counts_again_if_the_page_that_lifted_it_counts_no_more(plants: Plant) -> None:
+    south, west = plants.member("south", "base", "keeper"), plants.member("west", "line", "keeper")
+    west.unlock()
+    ban = seal_revocation(west.vault.identity(), uuid=UUID, node=KEY, why="lost", created=datetime.now(UTC))
+    west.plant.record_event("revoked", UUID, statement=ban.statement)
+    pin(plants.north)
+    plants.round()
+    copy = plants.folder / "copy"
+    shutil.copytree(south.home, copy)
+    south.plant.record_event("lifted", None, of=hash_of_statement(ban.statement))
+    plants.round()
+    assert plants.north.policy.revocation(UUID) is None
+    stick = plants.folder / "other stick"
+    stick.mkdir()
+    with Station.open(copy, ask=ask) as twin:
+        twin.plant.record_event("named", UUID, name="hand")
+        plants.sync(twin, stick)
+    plants.sync(plants.north, stick)
+    assert "two-histories" in alarms(plants.north)
+    assert plants.north.policy.revocation(UUID) is not None
 
 
 def test_a_second_sync_with_nothing_new_does_nothing(plants: Plant) -> None:
@@ -142,7 +186,9 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     with pytest.raises(ForkError, match="copy of this home"):
         plants.sync(west)
     assert west.plant.unsent() >= 1
+    assert west.plant.home == copy.plant.home
     assert resume(west, plant.folder_transport.FolderTransport(plants.stick)) == 1
+    assert west.plant.home != copy.plant.home, "if the copy writes again, its pages show that they are of another home"
     plants.sync(west)
     plants.sync(plants.north)
     roster = plants.north.plant.roster
