@@ -144,6 +144,14 @@ def test_a_node_that_does_not_answer_is_unconfirmed_and_can_be_tried_again(pair:
     assert held(pair.north, pair.board) == []
 
 
+def test_a_node_that_was_out_of_service_and_proves_that_it_was_reset_is_out_of_it_no_more(pair: Pair) -> None:
+    retire(pair.north, pair.board.uuid, None)
+    reset(pair.north, pair.board)
+    record = pair.north.nodes.get(pair.board.uuid)
+    assert record is not None
+    assert (record.retired, record.state) == (None, int(NodeState.FACTORY))
+
+
 # -- replace ----------------------------------------------------------------------------------------------------------
 
 

@@ -106,6 +106,16 @@ def test_boards_are_only_read_until_all_have_answered_and_not_read_again(
     assert [words.count(word) for word in ("read 128", "prove", "list", "request")] == [3, 3, 3, 3]
 
 
+def test_an_authentic_board_is_finished_until_it_says_that_it_was_reset(
+    everyone: Callable[[Bus], list[BoardResult]],
+) -> None:
+    (one,) = boards(1)
+    assert [done.result for done in everyone(Bus([at(1, one)]))] == ["passed"]
+    assert everyone(Bus([at(1, one)])) == []
+    one.tim.reset_by_hand()
+    assert [done.result for done in everyone(Bus([at(1, one)]))] == ["passed"]
+
+
 def test_two_boards_of_one_uuid_are_both_left_alone_however_late_the_second_one_answers(
     station: Station, everyone: Callable[[Bus], list[BoardResult]]
 ) -> None:

@@ -30,6 +30,7 @@ from teds_provision.provisioning.sign import known_node_keys
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import possession_check
 from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_at_node, verify_in_session
+from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.access_code import AccessCode
@@ -167,6 +168,17 @@ def test_after_a_restart_the_rest_is_kept_until_it_is_read(station: Station, boa
     assert shown(station, board) == ("authentic", "kept")
     assert looked(station, board).kept, "another session of that power-up has not read it either"
     assert verified(station, board) == "authentic"
+    assert shown(station, board) == ("authentic", "session")
+
+
+def test_a_write_that_finds_everything_there_has_read_the_rest(station: Station, board: Board) -> None:
+    board.power_on()
+    assert looked(station, board).kept
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    with talk(board, over_the_bus(board)) as node:
+        require_session(station, node)
+        assert write(station, node, image).octets == 0
     assert shown(station, board) == ("authentic", "session")
 
 

@@ -10,6 +10,7 @@ from teds_provision.protocol.messages.frames import Function, Reason, decode_rep
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.teds_read import read_identity
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, MemoryLink, contact, talk
 
@@ -50,6 +51,16 @@ def test_an_open_that_came_second_is_tried_once_more(board: Board) -> None:
         node.open(key)
         assert node.sealed
         node.request(security_command(Function.IDENTIFY), "to identify")
+
+
+def test_what_a_node_said_in_a_session_is_asked_again_in_the_next(board: Board) -> None:
+    key = keyed(board)
+    with talk(board) as node:
+        for end in (node.forget, node.leave):
+            node.open(key)
+            assert node.proven is None
+            assert read_identity(node) == node.proven
+            end()
 
 
 def test_after_the_second_refusal_the_operator_is_told(board: Board) -> None:

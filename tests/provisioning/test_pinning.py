@@ -9,6 +9,7 @@ import pytest
 from teds_provision.errors import GarbledError, PolicyError, VaultError
 from teds_provision.provisioning import teds_read as reading
 from teds_provision.provisioning.identify import add_to_whitelist, identify
+from teds_provision.provisioning.whitelist import remove
 from teds_provision.station.station import Station
 from tests.bench import Board, MemoryLink, make_station, talk
 
@@ -30,6 +31,18 @@ def test_a_keyed_node_on_a_bus_is_listed_by_uuid_and_pinned_by_its_first_tap(
     pinned = station.pins.entry(board.uuid)
     assert pinned is not None
     assert pinned.fingerprint == shown.fingerprint
+
+
+def test_an_open_session_shows_that_a_board_whose_pin_was_taken_off_was_not_replaced(
+    station: Station, board: Board
+) -> None:
+    whitelist(station, board)
+    agree(station, board)
+    assert remove(station, board.uuid)
+    assert station.pins.is_unsettled(board.uuid)
+    whitelist(station, board)
+    agree(station, board)
+    assert not station.pins.is_unsettled(board.uuid)
 
 
 def test_one_damaged_key_does_not_hide_the_good_one(station: Station, board: Board) -> None:

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import LinkError, NoNodeError, NoReaderError, UsageError
-from teds_provision.links.ble.port import BlePort, cache_file
+from teds_provision.links.ble import port as ble_port
+from teds_provision.links.ble.port import BlePort, RememberedNodes, cache_file
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import LISTEN_SECONDS, Contact, DeadlineLink, Notice
 from teds_provision.node import node_template
@@ -19,7 +20,7 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.messages.ble import piece_octets
 from teds_provision.protocol.messages.frames import Command, Function, security_command, write_teds
-from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.node.measuring_station import SealedLine, keyed_node
 from tests.pace import PATIENCE, until
 
@@ -230,6 +231,26 @@ def test_a_node_that_was_met_before_is_asked_alone(air: Air, port: Ports) -> Non
     wanted = contacts[4].identity.uuid
     assert find(port(), lambda identity: identity.uuid == wanted).identity.uuid == wanted
     assert radio.do("counts")["connects"] == before + 1
+
+
+def test_the_cache_keeps_the_nodes_that_were_met_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ble_port, "MOST", 2)
+    known = RememberedNodes(tmp_path / "cache.json")
+    for number in range(4):
+        known.remember_node(f"C0:{number}", Identity(bytes([number] * 10), NodeState.KEYED, 1, 0, 1024, 0))
+    known.save()
+    assert [address for address, _ in RememberedNodes(tmp_path / "cache.json").items()] == ["C0:3", "C0:2"]
+
+
+def test_a_connection_is_kept_for_its_node_while_a_stream_of_it_is_open(port: Ports) -> None:
+    own = port()
+    connections = [own._link(f"C0:00:00:00:00:0{number}", quiet).connection for number in (1, 2)]
+    first = connections[0].number
+    seen = []
+    for change, stream in ((own.open_stream, 0), (own.open_stream, 1), (own.close_stream, 0), (own.close_stream, 1)):
+        change(first, stream, *([20] if change == own.open_stream else []))
+        seen.append([connection.streaming for connection in connections])
+    assert seen == [[True, False], [True, False], [True, False], [False, False]]
 
 
 def test_a_cache_that_is_damaged_or_stale_harms_nothing(air: Air, port: Ports) -> None:

@@ -239,6 +239,17 @@ def test_what_a_board_announced_while_it_was_served_is_no_news(other: bool) -> N
         succeeds(10, ended_the_pause, because="the machine may take the whole 15 ms for itself")
 
 
+def test_what_a_board_announces_after_a_later_question_is_news() -> None:
+    bus, stop = StillBus(), threading.Event()
+    arrivals = Arrivals(bus, quiet)  # type: ignore[arg-type]
+    [(address, identity)] = arrivals.round(stop)
+    assert list(arrivals.round(stop)) == []
+    announce = Announce(address, identity.state, uuid_crc(identity.uuid))
+    bus.announced = [Frame(announce.identifier, announce.encode(), False)]
+    arrivals.pause(stop)
+    assert bus.waited == 0, "it has started again"
+
+
 def test_watch_survives_a_bus_that_goes_away() -> None:
     hub = Hub()
     port = CanPort(hub.spec)
@@ -330,6 +341,17 @@ def test_an_address_is_good_again_as_soon_as_one_node_alone_answers_there(hub: H
         [contact] = port.find_all(seconds=3, notice=quiet)
         assert contact.identity.uuid == first.uuid
         assert contact.link.exchange(COUNT)
+
+
+def test_a_second_answer_that_comes_after_its_asker_has_left_shows_the_conflict_all_the_same(hub: Hub) -> None:
+    with opened(hub.spec) as port:
+        bus = port.bus()
+        with bus.gather(7) as asked:
+            hub.send(0x18DAF121, bytes([0x10, 26, 7, 1, 0, 23, 1, 0xAA]))
+            until(lambda: asked.replies.busy)
+        assert not bus.has_conflict(0x21)
+        hub.send(0x18DAF121, bytes([0x10, 26, 7, 1, 0, 23, 1, 0xBB]))
+        until(lambda: bus.has_conflict(0x21))
 
 
 def test_a_late_reply_to_a_station_that_died_makes_no_second_node(hub: Hub) -> None:
