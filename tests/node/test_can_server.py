@@ -6,13 +6,17 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 
+from teds_provision.errors import LinkError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import Pair, physical_id, single
 from teds_provision.links.can.spec import parse_spec
+from teds_provision.node.can import server as server_module
 from teds_provision.node.can.endpoint import CanEndpoint, StationState
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.worker_pool import MOST_THREADS, WorkerPool
@@ -25,6 +29,28 @@ from tests.places import free_tcp_port
 
 IDENTIFY = b"\x00\x00\x80\x07\x00\x00"
 COUNT = b"\x00\x00\x01\x7f\x00\x00"
+
+
+def test_a_node_comes_back_from_bus_off_after_a_second_and_waits_twice_as_long_while_it_recurs(
+    hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, now, waits = CanServer(hub.spec, EchoNode(0x21)), [1000.0], list[float]()
+    quiet = [0.0] * 6 + [61.0, 59.0]  # seconds on the bus, each time before it fails again
+
+    def fail(_woken: object) -> None:
+        now[0] += quiet.pop(0)
+        raise LinkError("bus-off")
+
+    def reopen(seconds: float) -> None:
+        waits.append(seconds)
+        if not quiet:
+            server._stop.set()
+
+    monkeypatch.setattr(server, "_serve_one", fail)
+    monkeypatch.setattr(server, "_reopen", reopen)
+    monkeypatch.setattr(server_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    server._serve(nullcontext())  # type: ignore[arg-type]
+    assert waits == [1, 2, 4, 8, 16, 30, 1, 2]
 
 
 class RawStation:
