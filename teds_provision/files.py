@@ -164,7 +164,7 @@ def read_limited(
 ) -> bytes:
     """Return the octets of a file, reading no more than ``max_octets`` of it.
 
-    ``path`` is a text where thousands of files are read: to make a path and its text again costs as much as to read.
+    ``path`` may be a text, for callers with thousands of files: making a Path takes as long as reading the file.
     ``follow`` False refuses a symbolic link. Raises NotFoundError (no such file), ``failure`` (it cannot be read), and
     BadDataError (larger than any ``what``).
     """
@@ -261,7 +261,7 @@ def _read(descriptor: int, size: int, most: int) -> bytes:
 def json_files(paths: Sequence[Path], what: str) -> list[str]:
     """Return named files, and every ``*.json`` below named folders, by name; each once.
 
-    As text: paths are made of them where they are read, by several processes.
+    As text, because the processes that read the files make paths of them.
     """
     found: list[str] = []
     for path in paths:
@@ -334,7 +334,7 @@ def sync_folder(folder: Path) -> None:
 def private_folder(folder: Path) -> Path:
     """Make a folder that only this user can use, or check one that is there; raises OSError.
 
-    One that belongs to someone else, that others may enter, or that is a link raises PermissionError: it may be a trap.
+    Raises PermissionError if it belongs to another user, is open to others, or is a link: it may be a trap.
     """
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)

@@ -8,7 +8,7 @@ gives the modules of a room (PEP 562): its ``__init__`` names them for type chec
     else:
         __getattr__ = lazy(__name__)
 
-Users write ``from teds_provision import measure`` on top and ``measure.blocks.Block`` where they need it; that loads
+Users write ``from teds_provision import measure`` on top and ``measure.blocks.Block`` in their code; that loads
 the module. Both are exceptions, which ``tests/test_house.py`` lists: imports are on top, by name.
 
 This module is below every room and imports nothing of ours.
@@ -150,7 +150,7 @@ def install_command(*requirements: str) -> str:
 
 
 def _as_it_came(requirement: str) -> list[str]:
-    """Return the words of pip for a requirement; an extra of ours comes from where this installation came from.
+    """Return the words of pip for a requirement; an extra of ours comes from the same source as this installation.
 
     A package index has the tool only once it is released, so an installation from a folder, a file or a repository
     (PEP 610, direct_url.json) names that one; if it is gone, the packages of the extra are named.

@@ -1,15 +1,15 @@
-"""All threads of a process on one processor core, and off it again when other work takes that core.
+"""Keep all threads of a process on one processor core, and leave that core when other processes need it.
 
-One thread of an interpreter runs at a time. On several cores its threads hand the interpreter's lock from core to core,
-and each handing over wakes a core that sleeps: a station with 200 nodes then takes two to three times the processor
+Because of the GIL, one thread of an interpreter runs at a time. On several cores, the threads hand the GIL from core to
+core, and each hand-over wakes a sleeping core: a station with 200 nodes then takes two to three times the processor
 time for the same work (docs/internals/speed.md).
 
-The core is one of those that the process may use (``taskset``, ``CPUAffinity=``, a cpuset), of the fastest kind, on
-which others have little to do; every two or three seconds their work is looked at. If they take a core, the threads go
-to a free one, and if they take all, to all: a thread that waits for its turn on one core of a busy machine waits twice
-as long as one that gets the next turn anywhere, and where none sleeps, none has to be woken. If another process gives
-the process other cores meanwhile, it stays as it was put. Processes are started in ``with every_core():``, so that they
-get all cores back. Linux alone; where the kernel's figures cannot be read, nothing is changed.
+The core is one that the process may use (``taskset``, ``CPUAffinity=``, a cpuset), of the fastest kind, with little
+load from other processes; that load is checked every two or three seconds. If it becomes too high, the threads move to
+a free core, or to all cores if none is free: on a busy machine, a thread that is bound to one core waits twice as long
+for its turn as one that may run on any, and busy cores need no waking. If another process changes this one's affinity
+meanwhile, that setting is kept. Start child processes in ``with every_core():``, so that they may use all cores. Linux
+only; if the kernel's figures cannot be read, nothing is changed.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _log = logging.getLogger(__name__)
 FIRST_LOOK: Final = 0.3  # seconds
 LOOK_SECONDS: Final = 2.0
 FREE: Final = 0.35
-"""The share of a core that others take at most if the threads go there."""
+"""A core counts as free if other processes use at most this share of it."""
 TAKEN: Final = 0.5
-"""The share of their core that others take at most while the threads stay there."""
+"""The threads leave their core if other processes use more than this share of it."""
 
 
 class Kernel(Protocol):
-    """What the kernel knows of cores and threads; its methods raise OSError, or ValueError for unknown figures."""
+    """The kernel's figures of cores and threads; methods raise OSError, or ValueError for unknown figures."""
 
     def allowed(self) -> Set[int]:
         """Return the cores that the calling thread may run on."""
@@ -117,9 +117,9 @@ def _capacity(core: int) -> int:
 
 
 class OneCore:
-    """Keeps the threads of this process on one core while one is free; raises OSError, ValueError: it cannot be done.
+    """Keeps the threads of this process on one core while one is free; raises OSError, ValueError if that fails.
 
-    ``core`` is where they are, None while they may run on all.
+    ``core`` is their present core; None while they may run on all.
     """
 
     def __init__(self, kernel: Kernel) -> None:
@@ -242,8 +242,8 @@ _IN_FORCE: Final[list[OneCore]] = []
 def one_core(kernel: Kernel | None = None) -> Iterator[OneCore | None]:
     """Keep all threads of this process on one core for the length of the block, while one is free.
 
-    Yields None where nothing is changed: one core alone, another system than Linux, a kernel that denies it or shows no
-    figures, a block inside of another one.
+    Yields None if nothing is changed: a single core, a system other than Linux, a kernel that refuses or has no
+    figures, or a nested block.
     """
     kept = None if _IN_FORCE else _keep(kernel or LinuxKernel())
     if kept is None:
@@ -259,7 +259,7 @@ def one_core(kernel: Kernel | None = None) -> Iterator[OneCore | None]:
 
 
 def _keep(kernel: Kernel) -> OneCore | None:
-    """Return the one core, None where nothing is changed."""
+    """Return the OneCore; None if nothing is changed."""
     if not hasattr(os, "sched_setaffinity"):
         return None
     with suppress(OSError, ValueError):

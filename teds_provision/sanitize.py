@@ -40,7 +40,7 @@ def sanitize_json(text: str) -> str:
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return a number with its noun: ``1 entry``, ``2 entries``; ``plural`` where an s is not enough."""
+    """Return a number with its noun: ``1 entry``, ``2 entries``; ``plural`` if an s is not enough."""
     return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 

@@ -77,7 +77,7 @@ def about_keyed(probe: Probe) -> str:
 
 @rule("locate", _SECTION, Stage.FACTORY)
 def locate(probe: Probe) -> str:
-    """Check that a board without a key blinks for anyone, for at most a minute; one that cannot answers 1."""
+    """Check that a board without a key blinks for any station, at most a minute; one that cannot blink answers 1."""
     if FirmwareFlag.LOCATE not in _report(_known(probe).payload).flags:
         return probe.refused(_locate(_SECONDS), Reason.UNKNOWN_COMMAND, "a board without anything to blink")
     probe.good(_locate(_SECONDS))
@@ -105,7 +105,7 @@ def manage_needs_session(probe: Probe) -> str:
 
 @rule("about-in-session", _SECTION, Stage.SESSION)
 def about_in_session(probe: Probe) -> str:
-    """Check that the report comes in a session too, and Manage gets 1 where the report does not offer it."""
+    """Check that the report comes in a session too, and Manage gets 1 if the report does not offer it."""
     report = _in_session(probe)
     probe.sealed_refused(security_command(Function.ABOUT, b"\0"), Reason.BAD_FORM, "one octet of payload")
     if FirmwareFlag.MANAGE not in report.flags:

@@ -196,7 +196,7 @@ def can_other_address(probe: Probe) -> str:
 
 @rule("can-functional", "CAN", Stage.PLAIN)
 def can_functional(probe: Probe) -> str:
-    """Identify alone is answered when everyone is asked: anything else gets no reply, not even a refusal."""
+    """Check that only Identify is answered when broadcast: other commands get no reply, not even a refusal."""
     asked = (security_command(Function.LIST), ABOUT, security_command(Function.OPEN), security_command(Function.CLOSE))
     with _stranger(probe) as stranger:
         for command in asked:

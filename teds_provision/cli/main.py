@@ -118,7 +118,7 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the table.
 
-        Lines that fit are written unchanged: click would look at each letter of them for where to break it.
+        Lines that fit are written unchanged: click would search each of them for places to break it.
         """
         width = max(map(len, COMMANDS))
         for title, entries in SECTIONS.items():

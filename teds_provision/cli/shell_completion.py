@@ -146,7 +146,7 @@ def _items(ctx: click.Context, found: Callable[[stations.Station], Iterable[tupl
 
 
 def _nodes(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return UUIDs and names of known nodes, groups where they are measured, and files where they are taken."""
+    """Return UUIDs and names of known nodes, and groups or files if the parameter accepts them."""
     groups = _groups(ctx, parameter, incomplete) if parameter.name == "what" else []
     nodes = _items(ctx, lambda station: station.nodes.beginning_with(incomplete, _MOST))
     return [*groups, *nodes] or _files(ctx, parameter, incomplete)

@@ -67,7 +67,7 @@ def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:
 
 @check("profiles", "machine")
 def profiles(system: System) -> Iterator[Finding]:
-    """Check that every profile in this home can be loaded; the shipped ones are tested where they are made."""
+    """Check that every profile in this home can be loaded; the project's tests cover the shipped ones."""
     folder = system.home / "profiles"
     if not folder.is_dir():
         yield Finding("profiles", "skipped", f"There is no folder {folder}.")

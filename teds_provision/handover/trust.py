@@ -263,7 +263,7 @@ _CA_SUFFIXES = (".ca.pem", ".ca.pub")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A key that someone wants trusted, its origin, and the CA's signature over it if the file has one."""
+    """A key that the user wants to trust, its origin, and the CA's signature over it if the file has one."""
 
     record: TrustRecord
     path: Path

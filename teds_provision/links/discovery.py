@@ -87,7 +87,7 @@ class BroadcastPace:
     """Decides when to broadcast again: ``asked`` is when that was last done.
 
     While a node is missing that is after ``first`` seconds, then after LEAST, doubling to MOST. ``first`` is short on a
-    bus, where a question, or its answer, may have been lost.
+    bus, because a request or its answer may have been lost.
     """
 
     def __init__(self, asked: float, *, first: float = LEAST) -> None:

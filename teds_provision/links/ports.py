@@ -148,7 +148,7 @@ class ResendLink(Protocol):
 
 @runtime_checkable
 class MultiStationLink(Protocol):
-    """The link to a node on a bus, where other stations can ask it as well (CAN): under their addresses.
+    """The link to a node on a bus with several stations (CAN), each with its own address.
 
     ``address`` is the node's; a node that has moved is asked at its new one once this is set.
     """

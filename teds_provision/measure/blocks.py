@@ -88,7 +88,7 @@ class Block:
     """Samples of one stream, checked and calibrated: n instants of c channels.
 
     ``raw`` is n × c of a dtype that holds every raw value exactly (integer, float64, else object). ``value`` is n × c
-    float64, NaN exactly where ``valid`` is False. With ``test_pattern`` there are no measurements in it: every value is
+    float64, NaN exactly if ``valid`` is False. With ``test_pattern`` there are no measurements in it: every value is
     NaN, and each sink marks what it writes.
     """
 

@@ -173,7 +173,7 @@ class StreamInterpreter:
         return self._steps[:count], self._seconds[:count]
 
     def _values(self, octets: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return raw values, values (NaN where not valid), and validity of the instants in messages."""
+        """Return raw values, values (NaN if not valid), and validity of the instants in messages."""
         if self._many is not None:
             if self._until_calibrated:
                 self._until_calibrated -= 1

@@ -38,7 +38,7 @@ def readers() -> Iterator[LinkSurvey]:
 
 
 def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
-    """Ask everyone on each of these places, one after the other; at most a second each."""
+    """Send a broadcast at each of these places in turn, at most a second each."""
     for place in places:
         if not capabilities_at(place).connectionless:
             yield LinkSurvey(place, "listed")

@@ -314,7 +314,7 @@ class NodeSupervisor:
             raise
 
     def _ask_who_answers(self) -> None:
-        """Ask everyone on the bus while nothing is asked of the node itself: its replies would hide a second board's.
+        """Send a broadcast while no request to the node is pending: its replies would hide a second board's.
 
         Only until its first value, for a caller that gives up in time: other waiters learn it from the next round.
         """

@@ -116,7 +116,7 @@ class Presence:
             _discard(self._digested, uuid_crc(uuid), uuid)
 
     def announced(self, place: str, announce: Announce) -> None:
-        """Take what a look-out heard; a hint that anyone can send."""
+        """Handle an Announce, which any device can send: a hint."""
         with self._turn:
             named = {uuid for uuid in self._digested.get(announce.crc, ()) if self._announced[uuid][0][0] == place}
             meant = named | self._placed.get((place, announce.address), set())
@@ -219,7 +219,7 @@ class Presence:
         return AddressConflictError(error.message, hint=error.hint)
 
     def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
-        """Return where to search for a node. A place that was wrong is not tried while another one may still answer."""
+        """Return where to search for a node. A wrong place is not tried while another may answer."""
         wrong, seen = self._wrong.get(uuid, {}), self._seen.get(uuid, {})
         places = [sighting for sighting in seen.values() if sighting.at >= fresh]
         best = min(

@@ -20,7 +20,7 @@ from teds_provision.station.store.lock import UsageLock, UsageLockTakenError
 
 @contextmanager
 def sole_user(station: Station, ports: Iterable[MeasuringLink], command: str) -> Iterator[None]:
-    """Use the source addresses of these ports alone, where they have one; without a named one, the next free one.
+    """Reserve the source addresses of the ports that have one for this process; if none is named, the next free one.
 
     Raises StoreLockedError (7) if another process of this home has the named one; AddressConflictError (5) if another
     machine is heard to measure under it.

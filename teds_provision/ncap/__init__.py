@@ -10,7 +10,7 @@ module                      what it does
 ``measurement_supervisor``  what it measures, across restarts
 ``running_measurement``     one measurement: its nodes, their reports, its state
 ``membership``              which nodes join, wait and are tried again, decided without threads
-``sinks``, ``names``        where values go, and under which topics
+``sinks``, ``names``        destinations of values, and their topics
 ``live``                    values and events to many clients, none of which holds up another
 ``nodes/``                  the nodes on its links, and what is done with them
 ``web/``                    HTTP: the guard, tokens, routes

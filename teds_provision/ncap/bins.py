@@ -23,7 +23,7 @@ _REAL, _BITS = struct.Struct("<f"), struct.Struct("<I")
 
 
 class SegmentedBins:
-    """What both kinds have: the newest bin, and where each segment begins."""
+    """Common part of both kinds of bins: the newest bin, and the first bin of each segment."""
 
     def __init__(self, width: float, size: int) -> None:
         self.width, self.size = width, size

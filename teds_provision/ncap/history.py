@@ -246,7 +246,7 @@ class History:
         """Return at most ``points`` bins of a channel between two moments (unix seconds; None: an hour ago, now).
 
         ``bin`` is their width in s, ``time`` their beginnings; a bin in which nothing happened is left out. ``low`` and
-        ``high`` are SI values, None where none was valid, or raw numbers in a segment that is ``raw`` (no calibration).
+        ``high`` are SI values, None if none was valid, or raw numbers in a segment that is ``raw`` (no calibration).
         The last minute is given in bins of 10 ms if no more is asked for. ``segment`` is the ``id`` of each bin's
         segment, ``segments`` has the SI ``unit`` of each: values of two segments have different meanings. Raises
         NotFoundError if nothing of the channel was measured in that hour.

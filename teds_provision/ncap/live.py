@@ -250,8 +250,8 @@ def thinned(
     """Return at most ``most`` of these points, among them the least and the greatest of each of ``most // 2`` parts.
 
     Points stay in order and are measured ones; of a part without a value its first is kept, as a gap. ``before`` is the
-    last point before, for angles (rad) that wrap at a full turn: where they continue at the other end of the turn, a
-    gap is inserted, and there are fewer parts if necessary.
+    last point before, for angles (rad) that wrap at a full turn: a gap is inserted if they continue at the other end of
+    the turn, and there are fewer parts if necessary.
     """
     if before is None:
         return _extremes(times, values, most)

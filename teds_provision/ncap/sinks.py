@@ -158,10 +158,10 @@ def sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
     }
 
 
-def for_readers(told: Any) -> Any:
+def for_readers(value: Any) -> Any:
     """Return the form for a read-only token: files by their names, brokers without user and query."""
-    if isinstance(told, str):
-        return _FOLDERS.sub("", _QUERY.sub(r"\1", _USER.sub(r"\1", told))) if "/" in told else told
-    if isinstance(told, dict):
-        return {key: for_readers(value) for key, value in told.items()}
-    return [for_readers(sink) for sink in told] if isinstance(told, list | tuple) else told
+    if isinstance(value, str):
+        return _FOLDERS.sub("", _QUERY.sub(r"\1", _USER.sub(r"\1", value))) if "/" in value else value
+    if isinstance(value, dict):
+        return {key: for_readers(member) for key, member in value.items()}
+    return [for_readers(sink) for sink in value] if isinstance(value, list | tuple) else value

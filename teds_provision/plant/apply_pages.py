@@ -267,7 +267,7 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
 
 
 def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
-    """Return number and H of the pages of a chain that count; of another history none above where the two part."""
+    """Return number and H of the pages of a chain that count; of a fork, only those before the two histories part."""
     links = station.plant.pages.chain_links(chain.id)
     return frozenset(counting(links, last=_last(roster, chain.station), accepted=chain.accepted).pages)
 

@@ -28,7 +28,7 @@ LARGEST_PARCEL: Final = 64 << 20
 class FolderTransport:
     """A folder as a transport; files with other names are neither changed nor read."""
 
-    everybody = True
+    carries_all = True
     returned: Returned | None = None
 
     def __init__(self, folder: Path) -> None:

@@ -410,7 +410,7 @@ class LineUnit:
 
     @property
     def prepared(self) -> PreparedOrder:
-        """What the board gets; its name depends on the unit, which is on the disk then."""
+        """The board's order; waits until the unit, on which its name depends, is on the disk."""
         if self._waits:
             self.run.station.write_joining()
         return self._prepared

@@ -170,7 +170,7 @@ def branch(station: Station, of: str, hash: str | None, transport: Transport | N
         )
     branches = by_number[n]
     wanted = _among(branches, hash)
-    if hash is None and transport is not None and not transport.everybody:
+    if hash is None and transport is not None and not transport.carries_all:
         shown = {carried.number: carried for carried in transport.pages(of, n - 1)}
         wanted = [branch for branch in branches if n in shown and hash_of(shown[n].octets) == branch]
     if len(wanted) != 1:

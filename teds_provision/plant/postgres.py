@@ -5,8 +5,8 @@ name is verified, and logs in by SCRAM bound to that channel; no password is in 
 is one round trip, but for :meth:`Registry.pages`, which takes one for every few pages.
 
 No wait is endless: libpq's own keepalive is two hours, so ``tcp_user_timeout`` and short keepalives notice a connection
-that is half open, the server ends a statement after 60 s, and a watch of our own ends the connection if a server that
-hangs does not.
+that is half open, the server ends a statement after 60 s, and a watchdog ends the connection if the server itself
+does not.
 """
 
 from __future__ import annotations
@@ -400,7 +400,7 @@ class PostgresTransport:
     So a sync that finds nothing new is one round trip.
     """
 
-    everybody = False
+    carries_all = False
 
     def __init__(self, registry: Registry, where: str, station: str) -> None:
         self._registry, self._station = registry, station

@@ -117,7 +117,7 @@ class Delivery:
 class Inbox:
     """The documents of one kind for this station: those that a sync kept here, and those in the registry.
 
-    Each is given once until it is dropped, and nothing is read twice; anything else is left where it is. ``collect``
+    Each is given once until it is dropped, and nothing is read twice; other parcels remain in the registry. ``collect``
     and ``wait`` are for one thread at a time.
     """
 

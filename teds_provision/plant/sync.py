@@ -201,7 +201,7 @@ def _check_own_chain(
                 " own registry"
             )
     there = max((page.number for page in appended), default=0)
-    if connected and there < joined.acknowledged and not transport.everybody:
+    if connected and there < joined.acknowledged and not transport.carries_all:
         there = transport.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
         alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why, again=True)
@@ -214,7 +214,7 @@ def _own_pages(station: Station, transport: Transport, roster: Roster, done: Syn
     If only members can write, one that it did not sign stops everything.
     """
     found, junk = fetching.read_pages(transport.pages(station.fingerprint, above), roster, station.fingerprint)
-    if junk and not transport.everybody:
+    if junk and not transport.carries_all:
         alarm(
             station,
             "junk",
@@ -459,14 +459,14 @@ def _push(station: Station, transport: Transport, roster: Roster, done: SyncResu
     heads = transport.heads()
     for fingerprint, chain in station.plant.pages.chains().items():
         own = fingerprint == station.fingerprint
-        if not own and not transport.everybody:
+        if not own and not transport.carries_all:
             continue
         there = (
-            {hash_of(carried.octets) for carried in transport.pages(fingerprint, 0)} if transport.everybody else set()
+            {hash_of(carried.octets) for carried in transport.pages(fingerprint, 0)} if transport.carries_all else set()
         )
-        above = 0 if transport.everybody else heads.get(fingerprint, 0)
+        above = 0 if transport.carries_all else heads.get(fingerprint, 0)
         for n, hash, previous in station.plant.pages.chain_links(chain.id):
-            if n <= above or hash in there or (own and not transport.everybody and n > chain.counted[0]):
+            if n <= above or hash in there or (own and not transport.carries_all and n > chain.counted[0]):
                 continue
             row = station.plant.pages.get(chain.id, n, hash)
             assert row is not None
@@ -475,7 +475,7 @@ def _push(station: Station, transport: Transport, roster: Roster, done: SyncResu
     joined, newest = station.plant.joined, own_chain(station).counted[0]
     assert joined is not None
     # For a station that uses folders, each of them is the registry: a removable disk has another path on each machine.
-    by_folder = transport.everybody and (joined.url or "").startswith(FILES)
+    by_folder = transport.carries_all and (joined.url or "").startswith(FILES)
     if (connected or by_folder) and joined.acknowledged != newest:
         station.plant.put_record(replace(joined, acknowledged=newest))
 

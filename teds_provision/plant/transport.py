@@ -89,8 +89,8 @@ class Parcel:
 class Transport(Protocol):
     """Transport between the stations of one registry."""
 
-    everybody: bool
-    """True if pages of others are brought there too: a folder has no other way to get them."""
+    carries_all: bool
+    """True for a folder: stations also put the pages of other stations into it, which it gets in no other way."""
 
     returned: Returned | None
     """Pages that members handed in for stations that left; None for a folder, which all stations fill."""

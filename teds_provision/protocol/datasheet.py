@@ -109,7 +109,7 @@ def message_signature_good(teds: SecurityTeds, message: bytes) -> bool:
 
 
 def message_signature_good_once(teds: SecurityTeds, message: bytes) -> bool:
-    """Return :func:`message_signature_good` of a datasheet among many, which nobody asks for again."""
+    """Return :func:`message_signature_good` of a datasheet among many, without the cache."""
     key, signature = teds.station_key, teds.signature
     return key is not None and signature is not None and verify(key, message, signature)
 

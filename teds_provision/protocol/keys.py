@@ -221,7 +221,7 @@ def node_key_good(uuid: bytes, node: bytes, signature: bytes) -> bool:
 
 
 def node_key_good_once(uuid: bytes, node: bytes, signature: bytes) -> bool:
-    """Return :func:`node_key_good` of a node among many, which nobody asks for again."""
+    """Return :func:`node_key_good` of a node among many, without the cache."""
     return verify_once(node, node_key_message(uuid, node), signature)
 
 

@@ -88,14 +88,14 @@ _AT_THE_BOARD: Final = ("numpy",)
 class ProvisionRequest:
     """A request to ``provision``: one node (None: the one that is there), or many.
 
-    ``watch``: tap after tap. ``everyone``: every node of the bus that is not finished. ``sheet``: what each board gets.
+    ``watch``: tap after tap. ``whole_bus``: all unfinished nodes of the bus. ``sheet``: the order for each board.
     ``operator``: who worked, for the report; "" for the user of this account.
     """
 
     node: str | None = None
     order: BuildOrder = field(default_factory=BuildOrder)
     watch: bool = False
-    everyone: bool = False
+    whole_bus: bool = False
     sheet: Path | None = None
     report: Path | None = None
     operator: str = ""
@@ -103,7 +103,7 @@ class ProvisionRequest:
     @property
     def several(self) -> bool:
         """True if more than one node may be meant."""
-        return self.watch or self.everyone or self.sheet is not None
+        return self.watch or self.whole_bus or self.sheet is not None
 
 
 _AFTER: Final = ("build", "sign", "write", "verify", "check")
@@ -149,7 +149,7 @@ class BatchRun:
             named_for(station, self.node, self.prepared)
         self.progress = _progress(station, request, order)
         self.expected = 0  # number of boards on a bus to work on, once found
-        taps = self.progress is not None and not request.watch and not request.everyone
+        taps = self.progress is not None and not request.watch and not request.whole_bus
         self.stop = IdleStop(links.timeout if taps else None)  # a bus is searched once, without waiting for boards
         self._all_done = False
         self._early: EarlyReading | None = None
@@ -282,7 +282,7 @@ class BatchRun:
                 return
             _load_ahead()
             self._station.unlock()
-            for board in self._all_at_once(operator) if self._request.everyone else self._as_they_come(operator):
+            for board in self._all_at_once(operator) if self._request.whole_bus else self._as_they_come(operator):
                 self._note(board)
                 yield board
         finally:
@@ -299,7 +299,7 @@ class BatchRun:
         if self.progress is not None:
             if self.stop.ran_out:
                 self.progress.ran_out(f"was tapped within {self._links.timeout:.0f} s")
-            elif self._request.everyone and self._all_done:
+            elif self._request.whole_bus and self._all_done:
                 self.progress.ran_out("answered on the bus")
             return self.progress.totals()
         results = [board.result for board in self._boards]
@@ -327,11 +327,11 @@ class BatchRun:
         with one_core(), closing(open_port(self._links)) as port:
             if isinstance(port, EarlyFinder):
                 self._early = EarlyReading(at_once=self._at_once(port))
-            everyone, contacts = self._on_the_bus(port)
+            answers, contacts = self._on_the_bus(port)
             yield from self._side_by_side(port, contacts, operator)
             if not self.stop.is_asked:
                 self._all_done = True
-                refuse_duplicate_uuids(everyone)  # after the others, so that a conflict does not stop the finished part
+                refuse_duplicate_uuids(answers)  # after the others, so that a conflict does not stop the finished part
 
     def _at_once(self, port: Port) -> int:
         """Return how many boards are worked on at a time: as many as the bus and the token bear."""
@@ -345,12 +345,12 @@ class BatchRun:
                 "--all needs a bus: a reader sees one node at a time.",
                 hint="Use --watch to provision boards one tap after the other.",
             )
-        everyone = self._find_all(port)
-        found = drop_duplicate_uuids(everyone, self._reporter.notice)
+        answers = self._find_all(port)
+        found = drop_duplicate_uuids(answers, self._reporter.notice)
         contacts = [contact for contact in found if self._is_meant(contact)]
         if not contacts:
             self._require_known(found)
-        return everyone, contacts
+        return answers, contacts
 
     def _find_all(self, port: Port) -> list[Contact]:
         """Return every node of the bus; new ones that may be meant are read in plain while others are asked."""
@@ -591,7 +591,7 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
     if request.sheet is None:
         return None
     sheet = read_sheet(station, request.sheet, order)
-    if request.everyone and any(row.by_order for row in sheet.rows):
+    if request.whole_bus and any(row.by_order for row in sheet.rows):
         raise UsageError(
             "On a bus, rows cannot follow the order of taps.", hint="Give each row its uuid or fingerprint."
         )
@@ -617,7 +617,7 @@ def _require_consistent(request: ProvisionRequest, links: LinkSettings) -> None:
             "A single node cannot be combined with --all, --watch or --batch.",
             hint="Give either the node or one of these options.",
         )
-    if request.everyone and request.watch:
+    if request.whole_bus and request.watch:
         raise UsageError(
             "--all provisions the nodes that are on the bus now, --watch those that arrive.", hint="Use one of them."
         )

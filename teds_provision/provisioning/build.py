@@ -77,7 +77,7 @@ class BuildOrder:
     ``name`` may hold ``{uuid}`` (20 hex digits) or ``{n}`` (the first free number from 1). ``accept_calibration`` is
     the reason given for a calibration that the guard would refuse. ``channel`` is the one that the calibration is for
     (None: as its file states), ``due`` when the next one is due. Of a certificate ``item`` is the result to use,
-    ``choose`` is asked where several fit, and ``trusted`` are the files with certificates (PEM) of its signers.
+    ``choose`` is called if several fit, and ``trusted`` are the files with certificates (PEM) of its signers.
     """
 
     profile: str | None = None

@@ -145,7 +145,7 @@ class ShownKey:
 
 @dataclass(frozen=True)
 class EarlyAnswers:
-    """What a new board showed in plain: its key, which it proved, and the TEDS that it lists."""
+    """Answers of a new board outside a session: its key, which it proved, and the TEDS that it lists."""
 
     key: ShownKey
     listed: tuple[BlockId, ...]

@@ -1,9 +1,9 @@
-"""New boards of a bus are read and prove their keys while everyone is still asked who is there.
+"""Read new boards of a bus, and have them prove their keys, while the broadcast for them is still running.
 
-Whoever asks a bus has to wait for the last answer that a node may give, seconds in which the wire is idle. Two boards
-with one UUID must both be noticed before either becomes ours, so nothing is changed meanwhile, at a board or here: what
-is read (Security TEDS, proof of its key, List) is only what provisioning reads first, in plain. Where it fails it is
-forgotten, and provisioning itself reads it and reports the error.
+After a broadcast the station waits some seconds for the last possible answer, with an idle wire. Two boards with one
+UUID must both be noticed before either is keyed, so this phase changes nothing, neither on a board nor in the store. It
+only reads what provisioning would read first, outside a session: Security TEDS, proof of the key, List. A failed early
+reading is dropped; provisioning then reads the board itself and reports the error.
 """
 
 from __future__ import annotations

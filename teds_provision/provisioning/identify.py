@@ -25,7 +25,7 @@ from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning.conversation import Conversation, ShownKey
 from teds_provision.provisioning.firmware import keep_firmware, read_firmware
-from teds_provision.provisioning.meeting import Arrival, meet_everyone, watch_nodes
+from teds_provision.provisioning.meeting import Arrival, meet_all, watch_nodes
 from teds_provision.provisioning.parallel import ParallelWork
 from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.readings import keep_shown
@@ -92,7 +92,7 @@ def identify(
     """Read UUID and key, require the proof, and check both against this station's store.
 
     Raises KeyMismatchError (a known UUID with another key), NotAuthenticError, BadDataError, LinkError. A tap pins the
-    key that it brought; over a bus, where any device can use any UUID, only a whitelisted key is kept, and
+    key that it brought; over a bus, since any device can use any UUID, only a whitelisted key is kept, and
     ``last_seen`` changes only if the key that signed is known. State, epoch and address of a plain Identify are hints:
     they change nothing in the store, a session does. ``expect`` is called before anything is recorded, and raises if
     another node was meant. ``recall``: see :func:`examine`.
@@ -234,8 +234,8 @@ def describe(node: Conversation) -> Description:
 def new_whitelist_entry(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
     """Return the whitelist entry of an identified node, pinned to its key by tap, or by the bus of a new node.
 
-    A node that already has a key is not pinned over a bus, where any device may show any UUID; its first tap does. Over
-    the air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
+    A node that already has a key is not pinned over a bus, since any device can use any UUID; its first tap pins it.
+    Over the air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
     """
     new = who.state == NodeState.FACTORY and node.wired
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
@@ -297,7 +297,7 @@ def identify_at(
         return
     first: TedsProvisionError | None = None
     proven: list[tuple[Conversation, ProvenNode]] = []
-    with meet_everyone(links, reporter) as nodes:
+    with meet_all(links, reporter) as nodes:
         for node, found in _side_by_side(nodes, lambda node: _identified(station, node, add)):
             if isinstance(found, ProvenNode):
                 proven.append((node, found))

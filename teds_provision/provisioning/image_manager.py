@@ -106,7 +106,7 @@ class ImageManager:
     # -- the upload ------------------------------------------------------------------------------------------------
 
     def upload(self, octets: bytes, progress: Progress) -> int:
-        """Bring an image into the other slot, from where the board has it; return the octets sent.
+        """Upload an image into the other slot, starting after the octets that the board has; return the octets sent.
 
         A lost session is opened again, and lost frames make the packets shorter.
         """

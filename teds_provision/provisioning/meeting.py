@@ -49,7 +49,7 @@ def meet(
 
     Of several nodes on a bus it selects the only one that is not finished yet. ``before`` is called when the link is
     open and the wait has not begun: the time to ask for a passphrase. If no link was chosen, ``uuid`` is searched on
-    the buses that are named, else on the one where it was met last, and then at the reader. Raises NoReaderError,
+    the named buses, else on the bus of its last contact, and then at the reader. Raises NoReaderError,
     NoNodeError after ``links.timeout`` seconds, AddressConflictError, UsageError if several nodes qualify.
     """
     if uuid is None:
@@ -106,7 +106,7 @@ def _met_somewhere(
     reporter: Reporter,
     before: Callable[[], object],
 ) -> Conversation:
-    """Meet a node where it may be: a short search at each known place, then a tap.
+    """Meet a node: a short search at each known place, then a tap.
 
     Without a reader there is no tap, and the first place gets all the remaining time.
     """
@@ -143,7 +143,7 @@ def _met_somewhere(
 
 
 def likely_places(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> tuple[str, ...]:
-    """Return where nodes may be if no link was chosen: the named buses, else the place of each node's last contact.
+    """Return the places to search if no link was chosen: the named buses, else the place of each node's last contact.
 
     Places are ``LINK:PORT``; empty if a link was chosen, or if none is known.
     """
@@ -192,12 +192,12 @@ def avoid_measuring_source(station: Station, port: Port, uuid: bytes) -> None:
 
 
 @contextmanager
-def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conversation]]:
+def meet_all(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conversation]]:
     """Wait for any node and give a conversation with each that is there: the tapped one, or all on the bus."""
     port = open_port(links)
     try:
-        everyone = port.find_all(seconds=links.timeout, notice=reporter.notice, listen=links.listen)
-        contacts = drop_duplicate_uuids(everyone, reporter.notice)
+        answers = port.find_all(seconds=links.timeout, notice=reporter.notice, listen=links.listen)
+        contacts = drop_duplicate_uuids(answers, reporter.notice)
         with ExitStack() as stack:
             yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]
     finally:
@@ -415,7 +415,7 @@ def _together(
         try:
             for arrival in _watch(port, work, reporter, stop):
                 arrivals.put(arrival)
-        except BaseException as error:  # noqa: BLE001 - told by the thread that gives the results
+        except BaseException as error:  # noqa: BLE001 - raised again by the thread that yields the results
             arrivals.put(error)
 
     threads = [threading.Thread(target=serve, args=(port,), name=port.place, daemon=True) for port in ports]

@@ -134,7 +134,7 @@ class Unit(Protocol):
 
     @property
     def prepared(self) -> PreparedOrder:
-        """What it gets, including its name; its unit is on the disk then. Raises PolicyError if none is left."""
+        """The board's order, including its name; its unit is on the disk. Raises PolicyError if no unit is left."""
 
     def sign(
         self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot

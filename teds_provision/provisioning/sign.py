@@ -115,9 +115,9 @@ def sign(
     ``node_sequence`` is the node's, as read in a session (or last known). ``on_node`` is the node's present Security
     TEDS and ``earlier`` those that were signed but perhaps never written: if one is exactly the same by the same
     signer, it is given back. ``sequence`` forces one (steps over more than 65536). ``keep_draft``: the signed image is
-    kept, with its ``profile``, until it is written. The new sequence is durable in the store before the signature is
-    given to anyone: one that was lost with its process was never seen, and its number may be used again. ``unit``: the
-    job and the unit that an office signs for, which its pages state too. ``write_follows``: in a run only the
+    kept, with its ``profile``, until it is written. The new sequence is durable in the store before the signature
+    is returned; a signature that was lost with its process was never used, so its number may be used again. ``unit``:
+    the job and the unit that an office signs for, which its pages state too. ``write_follows``: in a run only the
     node gets it, from :func:`~teds_provision.provisioning.write.write`, which waits for the disk before the signature
     leaves.
     ``before`` is called before a new signature is made; what it raises leaves the sequence as it is.

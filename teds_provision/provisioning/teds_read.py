@@ -39,8 +39,8 @@ READING_SECONDS = 300.0
 def read_block(node: Conversation, block: BlockId, *, until: float | None = None) -> bytes:
     """Read one TEDS, segment by segment, up to its Length (or as the node has octets).
 
-    Outside a session, where no tag distinguishes noise from a bad TEDS, one with a wrong checksum is read again: two
-    equal readings are what the node has. ``until`` is a monotonic time. Raises NodeRefusedError (18: no such TEDS) and,
+    Outside a session no tag distinguishes noise from a bad TEDS, so one with a wrong checksum is read again: two equal
+    readings count. ``until`` is a monotonic time. Raises NodeRefusedError (18: no such TEDS) and,
     for a Length beyond 1 MiB (of a Security TEDS, 65535 octets), BadDataError in a session, GarbledError outside one.
     """
     octets = _read_once(node, block, until)

@@ -1,6 +1,6 @@
 """New firmware for boards: look, upload, restart, prove in the session, confirm; or see the old image come back.
 
-Nothing durable is kept here: what a board reports in the session decides where the same call goes on after a cut. Which
+Nothing durable is kept here: after a cut, the next call continues from what the board reports in the session. Which
 image may run is the decision of its boot loader, which checks the owner's signature (docs/firmware-update.md).
 """
 
@@ -80,7 +80,7 @@ class UpdateOrder:
 
 @dataclass(frozen=True)
 class UpdatePlan:
-    """The plan of an update for one board: ``stage`` is where it begins. ``question``: asked before, "" for none.
+    """The plan of an update for one board: ``stage`` is its first step. ``question``: asked before, "" for none.
 
     ``interrupts`` names the measurements that pause; ``octets`` go over the link in about ``seconds``.
     """
@@ -294,7 +294,7 @@ class _Look:
         )
 
     def _look(self, node: Conversation) -> tuple[FirmwareReport, Stage]:
-        """Return the board's report in the session, and where the update begins; raises if it may not."""
+        """Return the board's report in the session, and the first step of the update; raises if it is not permitted."""
         report = read_about(node)
         if report is None:
             raise NoUpdateError(

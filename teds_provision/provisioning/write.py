@@ -118,7 +118,7 @@ def _after_commit(image: Image, read: Image | None) -> Iterable[BlockId] | None:
 
     ``read`` is what it was read to have before, in the same session. Only a commit changes that: it puts in what the
     image has, and nothing was there that the image has not. The Security TEDS, which is read back, is another one if
-    anyone else committed meanwhile.
+    another station committed meanwhile.
     """
     if read is None or read.blocks.keys() - image.blocks.keys():
         return None
@@ -263,8 +263,8 @@ def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId
     """Write every block but those of ``skip`` into the node's staging; return the octets written.
 
     The Security TEDS is the last (profile.md, "Writing to flash"): a node that cannot rewind may count on it, and the
-    others go while the sequence is on its way to the disk, which the signature waits for. If frames are lost the pieces
-    shrink: a short one comes through where a long one never would.
+    others are sent while the sequence is written to the disk, for which the signature waits. If frames are lost the
+    pieces shrink: on a bad link, short ones arrive while long ones never do.
     """
     piece = node.identity.max_message - WRITE_OVERHEAD
     blocks = [block for block in sorted(image, key=lambda block: block == SECURITY) if block not in skip]

@@ -93,7 +93,7 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of a channel in seconds, NaN where not stated; ``period`` is SPeriod."""
+    """Times of a channel in seconds, NaN if not stated; ``period`` is SPeriod."""
 
     period: float = NOT_STATED
     update: float = NOT_STATED
@@ -105,7 +105,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Channel:
-    """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN where it does not.
+    """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN if it does not.
 
     ``units`` are the exponents of PhyUnits, ``unit`` the unit in which its values are computed, ``shown`` the display
     unit: ``display`` if a profile names one, else ``unit``. ``kind`` is None for a ChanType that is not known, ``halt``

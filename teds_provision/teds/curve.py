@@ -28,7 +28,7 @@ FLOAT32_STEP: Final = 2.0**-23
 
 @dataclass(frozen=True)
 class CurveChannel:
-    """Facts of a channel, in SI units; NaN where not stated."""
+    """Facts of a channel, in SI units; NaN if not stated."""
 
     number: int
     units: Units

@@ -1,6 +1,6 @@
 """The guard: refuses calibrations of the kinds that have hurt robots before.
 
-Erased words, a sign or slope reversed, gain and offset swapped, a table that is not monotone where it must be, results
+Erased words, a sign or slope reversed, gain and offset swapped, a table that must be monotone and is not, results
 beyond the limits, a fit worse than the stated uncertainty. Checked over every raw value that the channel can give: all
 that its data model allows, or the ``raw-range`` of its profile. Findings are in physical units.
 """

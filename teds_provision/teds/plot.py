@@ -178,7 +178,7 @@ class _View:
         return wrapped(values, ends[0], ends[1], abs(self.unit.difference_from_si(TURN)))
 
     def _drawn(self, values: Any) -> Any:
-        """Return the values of a line, with a gap where an angle continues at the other end of its turn."""
+        """Return the values of a line, with a gap if an angle continues at the other end of its turn."""
         if not self.channel.full_turn:
             return values
         values = self._wrapped(values)
@@ -187,7 +187,7 @@ class _View:
         return values
 
     def curve(self, axes: Any) -> None:
-        """Draw the curve, solid where it was calibrated and dotted beyond; its points, or the nodes of a table."""
+        """Draw the curve, solid within the calibrated range and dotted beyond; its points, or the nodes of a table."""
         inside = self._thinned(self.inside)
         for number, line in enumerate(self.lines):
             label = "calibration" if number == 0 else None

@@ -69,9 +69,9 @@ class SheetFinding:
 
 @dataclass(frozen=True)
 class Meta:
-    """The node as a whole: Meta-TEDS and its name. Times in seconds, NaN where not stated.
+    """The node as a whole: Meta-TEDS and its name. Times in seconds, NaN if not stated.
 
-    ``uuid`` has 10 octets (2007) or 16 (2024), ``channels`` is MaxChan; None where not stated. ``vectors`` are the
+    ``uuid`` has 10 octets (2007) or 16 (2024), ``channels`` is MaxChan; None if not stated. ``vectors`` are the
     members of each vector group, in their order. ``origin`` is what a wrapped node has its values from.
     """
 

@@ -861,7 +861,7 @@ PATTERNS = (
     Pattern(
         "a folder that lacks pages forgot nothing",
         "_check_own_chain",
-        "connected and there < joined.acknowledged and (not transport.everybody)",
+        "connected and there < joined.acknowledged and (not transport.carries_all)",
         "connected and there < joined.acknowledged",
         "tests/plant/test_own_head.py",
     ),

@@ -34,7 +34,7 @@ def ask(prompt: str, confirm: bool) -> str:
 class MemoryTransport:
     """A post office in memory: what one station sends lies there for the other."""
 
-    everybody: bool = False
+    carries_all: bool = False
     where: str = "memory"
     there: dict[str, Parcel] = field(default_factory=dict)
     full: bool = False

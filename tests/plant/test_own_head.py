@@ -22,7 +22,7 @@ from tests.plant.stations import Plant, ask
 class Registry(FolderTransport):
     """A transport as a registry's database is one: each member appends its own pages and reads those that it lacks."""
 
-    everybody = False
+    carries_all = False
 
     def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
         return (page for page in super().pages(station, after) if page.number > after)

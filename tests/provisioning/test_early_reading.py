@@ -78,7 +78,7 @@ def everyone(station: Station, monkeypatch: pytest.MonkeyPatch) -> Callable[[Bus
         for uuid in {one.identity.uuid for one in [*bus.contacts, *bus.late]}:
             station.pins.put(WhitelistEntry(uuid, None, assurance="uuid"))
         monkeypatch.setattr(batch, "open_port", lambda links: bus)
-        request = ProvisionRequest(order=BuildOrder(TYPE), everyone=True)
+        request = ProvisionRequest(order=BuildOrder(TYPE), whole_bus=True)
         return list(BatchRun(station, LinkSettings("can"), request, SilentReporter()).many(Answers()))
 
     return run

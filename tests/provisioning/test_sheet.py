@@ -294,7 +294,7 @@ def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another process changed the passphrase while nodes of a bus were worked on: finished ones are reported."""
-    boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(everyone=True), SilentReporter())
+    boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(whole_bus=True), SilentReporter())
     contacts = [on_reader_number(number) for number in range(4)]
     locked, begun = threading.Event(), threading.Barrier(4)
 

@@ -163,7 +163,7 @@ def _named(keystore: str | None) -> str:
 
 
 def _require_place(home: Path, file: Path) -> None:
-    """Refuse a folder that is not there, and the station's own files, before anyone is asked for a passphrase."""
+    """Refuse a folder that is not there, and the station's own files, before asking for a passphrase."""
     folder = file.absolute().parent
     if not folder.is_dir():
         raise NotFoundError(f"There is no folder {folder}.")

@@ -1,4 +1,4 @@
-"""How much of a CAN bus data messages take."""
+"""The share of a CAN bus that data messages use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who came to a bus and who left it, for as long as it is watched."""
+"""Arrivals and departures of nodes on a watched bus."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _is_start(frame: Frame) -> bool:
 
 
 class Arrivals:
-    """The nodes of one bus; :meth:`round` asks everyone once and yields what is new."""
+    """The nodes of one bus; :meth:`round` sends one broadcast and yields what is new."""
 
     def __init__(self, port: WatchedPort, notice: NoticeSink) -> None:
         self._port, self._notice = port, notice
@@ -90,7 +90,7 @@ class Arrivals:
         self._listener = self._bus = None
 
     def round(self, stop: threading.Event) -> Iterator[tuple[int, Identity]]:
-        """Ask everyone (or ``node=`` alone) and yield address and identity of each node that is news."""
+        """Send a broadcast (or ask ``node=`` alone) and yield address and identity of each node that is new."""
         self._round += 1
         self._asked_at = time.monotonic()
         self._served.clear()
@@ -117,7 +117,7 @@ class Arrivals:
         return [uuid for uuid in self._seen if uuid_crc(uuid) in crcs]
 
     def pause(self, stop: threading.Event) -> None:
-        """Wait until everyone may be asked again, or a node announces itself; what a round took counts.
+        """Wait until the next broadcast may be sent, or a node announces itself; the time of the round counts.
 
         A board that was served may be changed meanwhile; what it announced while it was served is no news.
         """

@@ -1,4 +1,4 @@
-"""A CAN bus through python-can: opened, read and written, with every failure turned into one that names its cure."""
+"""Open, read and write a CAN bus through python-can; each failure is translated into an error with its remedy."""
 
 from __future__ import annotations
 
@@ -413,7 +413,7 @@ def _this_group_alone(bus: can.BusABC) -> None:
 
 
 def _probe(spec: CanSpec, options: dict[str, Any]) -> None:
-    """Ask whether anyone listens: python-can itself would try for 10 s without a pause."""
+    """Check that a server listens: python-can itself would try for 10 s without a pause."""
     try:
         socket.create_connection((str(options["host"]), int(options["port"])), timeout=3).close()
     except (OSError, ValueError) as error:

@@ -1,8 +1,7 @@
-"""One CAN bus for many threads: the reading one (:class:`BusReader`) hands each frame to those that wait for it.
+"""One CAN bus for many threads: the thread that reads (:class:`BusReader`) passes each frame to the waiting threads.
 
-Messages from nodes to this station are reassembled here, for all callers; flow control leaves at once from the thread
-that reads, so that a busy caller delays no other. Data frames, announcements and triggers go to listeners
-(:meth:`listen`).
+Messages from nodes to this station are reassembled here for all callers. The reading thread sends flow control at once,
+so that a busy caller delays no other. Data frames, Announces and triggers go to listeners (:meth:`listen`).
 """
 
 from __future__ import annotations

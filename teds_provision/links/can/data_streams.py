@@ -1,4 +1,4 @@
-"""Data messages on a CAN bus: the frames of open streams, put together (operation.md section 6)."""
+"""Reassembles data messages of open streams on a CAN bus (operation.md section 6)."""
 
 from __future__ import annotations
 

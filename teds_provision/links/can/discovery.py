@@ -1,7 +1,8 @@
-"""Finding nodes on a CAN bus for all waiting threads: announcements, and a functional Identify now and then.
+"""Finds nodes on a CAN bus for all waiting threads: by Announces, and by broadcasts (functional Identify).
 
-A missing node that announces itself is asked sooner. With ``poll`` the discovery also asks each address that announces
-itself, once in 10 s at most and five a second over all (operation.md section 7).
+If a missing node announces itself, the next broadcast is sent sooner. With ``poll`` the discovery also sends an
+Identify to each address that announces itself, at most once in 10 s each and five a second in all (operation.md
+section 7).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Identify over CAN: one functional request, the answers of all, and what they mean."""
+"""Broadcasts over CAN: one functional Identify, the answers of all nodes, and their evaluation."""
 
 from __future__ import annotations
 

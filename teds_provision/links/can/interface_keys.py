@@ -1,4 +1,4 @@
-"""The keys that an interface of python-can has: it silently ignores any other."""
+"""The option keys of each python-can interface: python-can silently ignores unknown ones."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """ISO 15765-2 between one pair of addresses: can-isotp's state machine, driven by events instead of polling.
 
 Normal fixed addressing with 29-bit identifiers: 0x18DA ‖ target ‖ source, functional 0x18DBFF ‖ source (ISO 15765-2,
-normal fixed addressing). We ask for 16 frames a block and no gap between them, pad with 0xCC, and take whatever block
-size, gap and padding the other side uses.
+normal fixed addressing). We request blocks of 16 frames without gaps, pad with 0xCC, and accept any block size, gap and
+padding of the other side.
 """
 
 from __future__ import annotations

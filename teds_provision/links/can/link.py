@@ -1,4 +1,4 @@
-"""One node's line on CAN: a request, its reply, and what is done about frames that were lost (profile.md, "CAN")."""
+"""The link to one node on CAN: requests, replies, and recovery from lost frames (profile.md, "CAN")."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""python-can's ``udp_multicast`` bus, without python-can's work for each frame.
+"""python-can's ``udp_multicast`` bus, without python-can's overhead per frame.
 
 The datagrams are python-can's own (a msgpack map of the fields of ``can.Message``), so that any program with python-can
 interoperates. Only reading and writing differ: a message object, a select and two clock readings a frame are left out,
-and our own frames do not come back. They leave from a separate socket, whose address no other program has; the kernel
-drops what comes from it before it wakes us (socket filter, Linux: ``man 7 socket``, SO_ATTACH_FILTER).
+and our own frames do not come back. They are sent from a separate socket, whose address no other program has; the
+kernel drops datagrams from it before they wake this process (socket filter, Linux: ``man 7 socket``, SO_ATTACH_FILTER).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The station's end of a CAN bus: finds nodes by Identify, exchanges frames with many, and lets others listen."""
+"""The station's port on a CAN bus: finds nodes by Identify, exchanges messages with many, and serves listeners."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def _ignore(*_: object) -> None:
 
 
 def _patience(left: float, known: int) -> float:
-    """Return the seconds of silence for which the answers to a question to everyone are waited for.
+    """Return the seconds of silence after which the answers to a broadcast count as complete.
 
-    ``left`` are those until the listening may end. Where many are ``known`` a last question fits in: the first frame of
-    an answer may be lost, and a node may have started meanwhile.
+    ``left`` are the seconds until the search may end. If many nodes are ``known``, leave time for a last broadcast: the
+    first frame of an answer may have been lost, and a node may have started meanwhile.
     """
     if known >= _MANY and left > 2 * SILENCE_SECONDS:
         left -= SILENCE_SECONDS
@@ -203,7 +203,7 @@ class CanPort(MeasuringLink):
         return True
 
     def discover(self, sightings: SightingSink, *, poll: float | None = None) -> CanDiscovery:
-        """Begin to find nodes: by announcements, and by asking everyone now and then."""
+        """Begin to find nodes: by announcements, and by a broadcast now and then."""
         return CanDiscovery(self, sightings, poll=poll)
 
     @property
@@ -286,7 +286,7 @@ class CanPort(MeasuringLink):
 
         while self.spec.node is None and (left := until - time.monotonic()) > 0:
             silence = _patience(enough - time.monotonic(), len(found.identities))
-            found = self._everyone(found, min(LONGEST_SECONDS, left), once, silence, show)
+            found = self._broadcast(found, min(LONGEST_SECONDS, left), once, silence, show)
             if found.conflicts:
                 raise conflict(min(found.conflicts))
             if found.identities and time.monotonic() >= enough:
@@ -301,7 +301,7 @@ class CanPort(MeasuringLink):
             )
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
-    def _everyone(
+    def _broadcast(
         self, known: FunctionalAnswers, longest: float, notice: NoticeSink, silence: float, show: _Shown
     ) -> FunctionalAnswers:
         """Ask all nodes, of many until no new one answers; return ``known`` with those that answered."""
@@ -395,7 +395,7 @@ class CanPort(MeasuringLink):
     def _among_all(
         self, wanted: Callable[[Identity], bool], seconds: float, notice: NoticeSink, reported: set[bytes]
     ) -> Contact | None:
-        """Ask everyone; ends with the first answer that is wanted."""
+        """Send a broadcast; ends with the first answer that is wanted."""
         found = FunctionalAnswers()
         for news in ask_all(
             self.bus(), self.next_transaction(), silence=SILENCE_SECONDS, longest=min(LONGEST_SECONDS, seconds)

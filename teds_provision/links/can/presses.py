@@ -1,6 +1,7 @@
-"""Find the board of a bus whose button was pressed: a hint for the person beside it.
+"""Finds the board on a bus whose button was pressed: a hint for the operator beside it.
 
-Two boards within a second, or two CRCs from one address, and neither is marked: anyone can send an Announce.
+If two boards are pressed within a second, or two CRCs come from one address, none is marked: any device can send an
+Announce.
 """
 
 from __future__ import annotations

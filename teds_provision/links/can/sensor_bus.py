@@ -1,6 +1,6 @@
-"""A bus on which devices that do not speak the profile send: frames with 11-bit and 29-bit identifiers, read only.
+"""A bus with devices that do not use the profile: frames with 11-bit and 29-bit identifiers, read only.
 
-:class:`~teds_provision.links.can.bus.Bus` hears the profile's frames alone; this one hears all others.
+:class:`~teds_provision.links.can.bus.Bus` receives only the profile's frames; this one receives all others.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How much of a bus its streams take, and when the next message of a long transfer may leave beside them.
+"""Measures the load of streams on a bus, and delays the messages of long transfers accordingly.
 
-Commands go before data on CAN (their identifiers are lower), so a transfer that sends as fast as it can would hold up
-every stream. All transfers of a process over one bus share what the streams leave of nine tenths of it. A bus without
-streams is theirs alone.
+On CAN, commands have priority over data (their identifiers are lower), so a transfer at full speed would delay every
+stream. All transfers of a process over one bus share nine tenths of it, minus the load of its streams. On a bus without
+streams, transfers are not delayed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""nfcpy, imported once, with the side effects of its import undone, and fixed where it hangs or waits.
+"""nfcpy, imported once, with the side effects of its import undone, and with fixes for a hang and for needless waits.
 
 Importing nfcpy 1.0.4 turns ``logging.captureWarnings`` on, sets its own logger to INFO and runs ``ldconfig`` and
 ``gcc`` from PATH to look for a libcrypto that only LLCP encryption would use. Import this module only if a reader or an

@@ -1,6 +1,6 @@
 """The functions of PC/SC that a reader needs, from pcscd's client library by ctypes: no package, no compiler.
 
-Types and numbers are those of pcsclite.h and wintypes.h on Linux, where DWORD and LONG are as wide as long.
+Types and numbers are those of pcsclite.h and wintypes.h on Linux (DWORD and LONG are as wide as long).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A tag in the field: activation and its NDEF message, on nfcpy, with nothing foreign getting out.
 
-Whatever nfcpy raises becomes :class:`FieldLostError` (the tag does not answer) or :class:`ReaderLostError` (the reader
+Exceptions of nfcpy become :class:`FieldLostError` (the tag does not answer) or :class:`ReaderLostError` (the reader
 does not).
 """
 

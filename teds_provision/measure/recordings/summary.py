@@ -28,7 +28,7 @@ class ChannelStatistics:
     high: float = -math.inf
 
     def saw(self, times: Any, values: Any) -> None:
-        """Count values (NaN where not valid) at these times."""
+        """Count values (NaN if not valid) at these times."""
         good = values[np.isfinite(values)]
         self.samples += len(values)
         self.invalid += len(values) - len(good)

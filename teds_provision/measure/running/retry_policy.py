@@ -30,7 +30,7 @@ class RetryPolicy:
         self._ends = timeout is not None
 
     def has_run(self) -> None:
-        """Handle its first value: from now on anyone could have sent a refusal, so it is retried without end."""
+        """Handle its first value: from now on a refusal may come from another device, so retry without end."""
         self._until = math.inf
 
     @property

@@ -220,7 +220,7 @@ class TopicSink(ThreadedSink):
         return changed
 
     def _find_joints(self, uuids: Iterable[str]) -> None:
-        """Find the joints of some nodes anew."""
+        """Find the joints of some nodes again."""
         found = {uuid: joints_of(self._facts.get(uuid, {}).values(), self._topics) for uuid in uuids}
         changed = [uuid for uuid, joints in found.items() if joints != self._joints_of.get(uuid, [])]
         if not changed:
@@ -428,7 +428,7 @@ class TopicSink(ThreadedSink):
         )
 
     def _command(self, uuid: str, channel: int, value: float) -> None:
-        """Handle a set point; non-finite numbers are refused here, limits are applied where units are known."""
+        """Handle a set point; non-finite numbers are refused here, and limits applied later, with the unit."""
         if self._commands is None or not math.isfinite(value):
             self.refused_commands += 1
             return

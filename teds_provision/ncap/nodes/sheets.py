@@ -209,8 +209,7 @@ def _warning(text: str) -> dict[str, str]:
 def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
     """Return every drawable calibration of one input: points of (raw value, value in ``y_unit``), at most 200.
 
-    An angle over a full turn is drawn as it is measured: within its limits, with a gap (the value None) where it
-    continues at the other end.
+    An angle over a full turn is drawn as it is measured: within its limits, with a gap (the value None) at each wrap.
     """
     sheet = Sheet.from_blocks(blocks)
     found = []
@@ -235,7 +234,7 @@ def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
 
 
 def within_a_turn(points: Sequence[tuple[float, float]], low: float) -> list[tuple[float, float | None]]:
-    """Return a line of (raw value, angle in rad) within [low, low + 2π], with None where it wraps."""
+    """Return a line of (raw value, angle in rad) within [low, low + 2π], with None at each wrap."""
     found: list[tuple[float, float | None]] = []
     for (x0, y0), (x1, y1) in zip(points, [*points[1:], *points[-1:]], strict=True):
         turn, last = (math.floor((y - low) / TURN) for y in (y0, y1))

@@ -2,7 +2,7 @@
 
 Each board is planned and updated by ``steps.update``, as the command ``update`` does it. Kept here is what was asked
 for and how each board ended, in ``updates/`` of the home, with the image until the action is over. After a restart the
-same action goes on with the boards that have no result: what a board reports decides where.
+same action goes on with the boards that have no result: the step at which a board continues follows from its report.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def front(hosts: tuple[str, ...], port: int, *, tls: bool) -> ServedNames:
 
 @dataclass
 class Guard:
-    """Wraps the application. ``front`` None: the Unix socket, where the caller is the user."""
+    """Wraps the application. ``front`` None: the Unix socket, whose caller is the user."""
 
     app: App
     tokens: Tokens

@@ -1,4 +1,4 @@
-"""One node on a CAN bus: a StationState for each base station, its answer to everyone, its Announces.
+"""One node on a CAN bus: a StationState for each base station, its answer to broadcasts, its Announces.
 
 Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationState.answer` and
 :meth:`StationState.restart` run in the jobs of its station.

@@ -186,7 +186,7 @@ class CanServer:
         self._pushing: set[tuple[CanEndpoint, Pair]] = set()
         self._looked = 0.0
         self._later: list[tuple[float, int, Callable[[], None]]] = []
-        self._everyone_due: dict[StationState, int] = {}
+        self._broadcast_due: dict[StationState, int] = {}
         self._number = itertools.count()
         self._lock = threading.RLock()
         self._sending = threading.Lock()
@@ -211,7 +211,7 @@ class CanServer:
         self._bus = Bus(self._spec)
         self._stop.clear()
         self._workers = WorkerPool()
-        self._active, self._pushing, self._later, self._everyone_due = set(), set(), [], {}
+        self._active, self._pushing, self._later, self._broadcast_due = set(), set(), [], {}
         self._endpoints = [
             CanEndpoint(node, tapped, self._workers, self._out, more) for node, tapped, more in self._nodes
         ]
@@ -370,7 +370,7 @@ class CanServer:
             body = read_single(frame.data)
             if body is not None and body[1:] == IDENTIFY.encode():  # the only command that is answered to a broadcast
                 for endpoint in self._endpoints:
-                    self._everyone(endpoint, station, body[:1], fd=frame.fd)
+                    self._on_broadcast(endpoint, station, body[:1], fd=frame.fd)
             return
         ends = addresses(frame.identifier)
         if ends is None:
@@ -433,7 +433,7 @@ class CanServer:
                 self._addresses.find()
             if self._stop.is_set() or state.gone or state.pairs.get(pair.own) is not pair:
                 return  # the station was lost meanwhile
-            self._end_answer_to_everyone(state, pair)
+            self._end_broadcast_answer(state, pair)
             try:
                 pair.send(reply)
             except LinkError:
@@ -443,22 +443,22 @@ class CanServer:
 
     # -- broadcasts ------------------------------------------------------------------------------------------------
 
-    def _everyone(self, endpoint: CanEndpoint, station: int, transaction: bytes, *, fd: bool) -> None:
+    def _on_broadcast(self, endpoint: CanEndpoint, station: int, transaction: bytes, *, fd: bool) -> None:
         """Answer a functional Identify after a random wait; a newer one of the same station takes its place."""
         own = endpoint.address
         state, _ = endpoint.pair(station, own)
-        number = self._everyone_due[state] = next(self._number)
+        number = self._broadcast_due[state] = next(self._number)
 
         def answer() -> None:
-            if self._everyone_due.get(state) != number or state.gone or endpoint.address != own:
+            if self._broadcast_due.get(state) != number or state.gone or endpoint.address != own:
                 return
             if state.replying is not None:
                 # A reply ends within N_Bs even if its station was killed. Do not queue answers behind it: each would
                 # wait for the one before, and the station drops answers to an older broadcast.
                 self._at_time(time.monotonic() + _SPREAD_SECONDS, answer)
                 return
-            del self._everyone_due[state]
-            self._answer_everyone(endpoint, station, own, transaction, fd=fd)
+            del self._broadcast_due[state]
+            self._answer_broadcast(endpoint, station, own, transaction, fd=fd)
 
         self._at_time(time.monotonic() + self._spread(), answer)
 
@@ -466,15 +466,15 @@ class CanServer:
         """Return the seconds to wait before an answer to a broadcast."""
         return random.uniform(0, _SPREAD_SECONDS)
 
-    def _answer_everyone(self, endpoint: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
+    def _answer_broadcast(self, endpoint: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
         """Send the answer; the stored reply stays, and no reply of this station is under way."""
         state, pair = endpoint.pair(station, own)
-        self._end_answer_to_everyone(state, pair)
+        self._end_broadcast_answer(state, pair)
         pair.speak(fd=fd)
         pair.send(transaction + Reply(True, endpoint.handler.identify()).encode())
         self._schedule(endpoint, pair)
 
-    def _end_answer_to_everyone(self, state: StationState, pair: Pair) -> None:
+    def _end_broadcast_answer(self, state: StationState, pair: Pair) -> None:
         """Abandon a broadcast answer without flow control; a reply to this station alone is kept."""
         if pair.waits_for_flow and state.replying is not pair:
             pair.stop_sending()
@@ -485,7 +485,7 @@ class CanServer:
         self._active.clear()
         self._pushing.clear()
         self._later.clear()
-        self._everyone_due.clear()
+        self._broadcast_due.clear()
         for endpoint in self._endpoints:
             endpoint.lose_stations()
 

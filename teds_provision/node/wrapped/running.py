@@ -35,7 +35,7 @@ class Reader(Protocol):
 
 @dataclass(frozen=True)
 class SensorPlace:
-    """Where the wrapped sensors are: ``source`` as given, its ``kind`` of Origin, the ``bus`` and CANopen node ids."""
+    """Source of the wrapped sensors: ``source`` as given, its ``kind`` of Origin, the ``bus`` and CANopen node ids."""
 
     source: str
     bus: str | None = None

@@ -96,8 +96,8 @@ class Roster:
     @cached_property
     def by_key(self) -> dict[str, Member | RemovedMember]:
         """Return all that it names, by fingerprint."""
-        everybody: tuple[Member | RemovedMember, ...] = (*self.members, *self.removed)
-        return {station.fingerprint: station for station in everybody}
+        stations: tuple[Member | RemovedMember, ...] = (*self.members, *self.removed)
+        return {station.fingerprint: station for station in stations}
 
     def member(self, fingerprint: str) -> Member | None:
         """Return a present member."""

@@ -292,7 +292,7 @@ class KeptMeasurement(MeasurementSpec):
 
 @dataclass(frozen=True)
 class TrustRecord:
-    """The public key of another station or of a CA, trusted because someone added it."""
+    """The public key of another station or of a CA, trusted because the operator added it."""
 
     name: str
     role: TrustRole

@@ -170,7 +170,7 @@ def evaluate(calibration: Calibration, *inputs: NDArray[np.float64]) -> Evaluati
 def evaluate(calibration: Calibration, *inputs: object) -> object:
     """Apply the formula and the zero offset to one value, or one array, per input.
 
-    Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 where an input is outside
+    Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 if an input is outside
     its boundaries or is NaN), else 0.0 or 1.0. Raises BadDataError for another number of inputs.
     """
     parts: tuple[CalibrationInput, ...] = calibration.inputs

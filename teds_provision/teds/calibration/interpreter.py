@@ -22,7 +22,7 @@ from teds_provision.teds.units import WrittenUnit
 
 @dataclass(frozen=True)
 class Values:
-    """A block of samples: ``raw`` by the data model, ``value`` in the channel's unit, NaN where not ``valid``.
+    """A block of samples: ``raw`` by the data model, ``value`` in the channel's unit, NaN if not ``valid``.
 
     Not valid: the raw value is impossible (more than SigBits, not a number), or the value is beyond the limits by more
     than the stated uncertainty, or is not a number. Angles over a full turn wrap, so no limit is beyond them.

@@ -81,7 +81,7 @@ class Calibration:
     ``unit`` is the calibrated unit with its conversion into SI (SIConvrt); limits, uncertainty and zero offset are in
     it. For an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
     (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds, ``zeroed`` when
-    the zero offset was set where the sensor is mounted. ``certificate`` is where it comes from, in a TEDS beside it.
+    the zero offset of the mounted sensor was set. ``certificate`` is its source, in a TEDS of its own.
     ``monotone`` and ``raw_range`` are what the transducer type demands and delivers, carried along so that the guard
     knows them without the profile.
     """

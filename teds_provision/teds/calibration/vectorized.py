@@ -33,7 +33,7 @@ _TABLES: Final[WeakValueDictionary[tuple[object, ...], NDArray[np.float64]]] = W
 
 
 class ManyChannels:
-    """Channels side by side; make one with :meth:`side_by_side`. Values are in SI units, NaN where not valid."""
+    """Channels side by side; make one with :meth:`side_by_side`. Values are in SI units, NaN if not valid."""
 
     def __init__(self, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> None:
         self._lay_curves([interpreter.channel.calibration for interpreter in channels])

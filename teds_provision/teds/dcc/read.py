@@ -201,7 +201,7 @@ def _day(node: Node) -> date:
 
 
 class _Reader:
-    """Reads the parts of one certificate; names are taken in one language where there are several."""
+    """Reads the parts of one certificate; of names in several languages, one is chosen."""
 
     def __init__(self, language: str) -> None:
         self.language = language

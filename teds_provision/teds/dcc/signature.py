@@ -213,7 +213,7 @@ def _leads_to(
 
 
 def _may_sign(certificate: x509.Certificate) -> bool:
-    """Return True if a certificate's key usage, where it states one, allows signatures."""
+    """Return True if a certificate's key usage, if it states one, allows signatures."""
     from cryptography import x509
 
     try:

@@ -55,7 +55,7 @@ def shipped_profiles() -> Path:
 
 
 def default_folders(home: Path | None = None) -> tuple[Path, ...]:
-    """Return where profiles are looked for, the first wins: <home>/profiles, the shipped ones, ./profiles.
+    """Return the folders of profiles in the order of the search: <home>/profiles, the shipped ones, ./profiles.
 
     So a stray file in the working folder never replaces a type that comes with the tool; one's own version of such a
     type is in the home, or is named by its path.

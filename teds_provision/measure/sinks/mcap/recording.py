@@ -1,11 +1,11 @@
 """MCAP recorder: one topic for each stream at full rate, one for each channel, the datasheet's facts, reports.
 
 A message of a stream holds one instant of it (definition SAMPLES below, CDR, described in the file itself, so that
-readers of ROS 2 messages decode it): calibrated values, NaN where not valid, and the raw values. Its log time is the
+readers of ROS 2 messages decode it): calibrated values, NaN if not valid, and the raw values. Its log time is the
 instant. Unless the sink was made without, each channel also has a topic of ``std_msgs/Float64``, which viewers plot
 without a panel of their own. Chunks are 64 KiB and at most FLUSH old. The facts of channels are in the metadata of
-their stream's topic, in a metadata record, and in a ``std_msgs/String`` on ``…/teds`` at the start of each file, where
-``ros2 bag`` users look.
+their stream's topic, in a metadata record, and in a ``std_msgs/String`` on ``…/teds`` at the start of each file, for
+users of ``ros2 bag``.
 """
 
 from __future__ import annotations
