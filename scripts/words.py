@@ -1,20 +1,25 @@
 """Count the words that hold readers of the code up: a mirror, not a gate.
 
-Usage: python scripts/words.py [DIRECTORY]. Prints a table; `make words` runs it. Rates are per 10,000 words of
-docstrings, so that they can be compared with other codebases (zigpy, sigstore-python, python-tuf, esptool: the last
-column has the highest of the four).
+Usage: python scripts/words.py [DIRECTORY]. Prints two tables; `make words` runs it. The first is about docstrings and
+names. Its rates are per 10,000 words of docstrings, so that they can be compared with other codebases (zigpy,
+sigstore-python, python-tuf, esptool: the last column has the highest of the four). The second has the same turns, and
+some more, in comments: of Python, of the node in C, and of the web page.
 """
 
 from __future__ import annotations
 
 import ast
+import io
 import re
 import sys
+import tokenize
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent.parent / "teds_provision"
+FIRMWARE = "firmware"
+"""The folder beside the package with the node in C, in `src` and `include`."""
 
 RATES = (
     ("where", r"\bwhere\b", "9"),
@@ -26,6 +31,20 @@ RATES = (
     ("Return, Raise, Yield", r"\b(Return|Raise|Yield)s?\b", "88 to 144"),
 )
 """A label, the expression that is counted in docstrings, and the rate of the codebases compared with."""
+
+IN_COMMENTS = (
+    *RATES[:6],
+    ("everyone, anyone, someone", r"\b(every|any|some) ?one\b", ""),
+    ("hears, asks, looks (of programs)", r"\b(hears?|heard|asks|looks?|looked)\b", ""),
+    ("'no' for a complement: is no number", r"\b(is|are) no\b", ""),
+)
+"""As RATES, for comments, in which `Return` and its kin are rare."""
+
+DIRECTIVE = re.compile(r"(type: ignore|noqa|pragma|fmt|ruff|pyright|SPDX|!|@)")
+"""Comments that a tool reads, and Doxygen's commands."""
+
+FOREIGN = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'(?:[^\'\\\n]|\\.)*\'|`(?:[^`\\]|\\.)*`|/\*.*?\*/|//[^\n]*', re.DOTALL)
+"""A text or a comment in C or JavaScript."""
 
 FUNCTIONS = ("take", "_take", "let_go", "of", "tell", "_tell", "told", "ask", "found", "sure", "the_one")
 """Names of functions that have meant several things."""
@@ -111,11 +130,62 @@ def table(folder: Path) -> list[tuple[str, str, str]]:
     return rows
 
 
+def comments_of_python(text: str) -> Iterator[str]:
+    """Yield the comments of a Python source, each line by itself."""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.string.lstrip("# ")
+
+
+def comments_of_c(text: str) -> Iterator[str]:
+    """Yield the comments of a source in C or JavaScript, each as one line without its markers."""
+    for found in FOREIGN.finditer(text):
+        if found[0].startswith("//"):
+            yield found[0].lstrip("/ ")
+        elif found[0].startswith("/*"):
+            yield " ".join(re.sub(r"\n\s*\*", " ", found[0][2:-2].lstrip("*<")).split())
+
+
+def comments(folder: Path) -> dict[str, list[str]]:
+    """Return the comments of a package, of the node in C beside it, and of its web page, by a name for each."""
+    beside = folder.resolve().parent / FIRMWARE
+    sources = {
+        "Python": (comments_of_python, sorted(folder.rglob("*.py"))),
+        "C": (comments_of_c, sorted([*beside.glob("src/*.[ch]"), *beside.glob("include/**/*.h")])),
+        "page": (comments_of_c, sorted(folder.glob("ncap/page/js/**/*.js"))),
+    }
+    return {
+        name: [
+            comment
+            for path in paths
+            for comment in read(path.read_text(encoding="utf-8"))
+            if not DIRECTIVE.match(comment)
+        ]
+        for name, (read, paths) in sources.items()
+    }
+
+
+def table_of_comments(folder: Path) -> list[tuple[str, ...]]:
+    """Return the rows of the second table: a label, and a figure for each kind of source."""
+    found = comments(folder)
+    words = {name: sum(len(comment.split()) for comment in texts) for name, texts in found.items()}
+    rows: list[tuple[str, ...]] = [("words in comments", *map(str, words.values()))]
+    for label, expression, _ in IN_COMMENTS:
+        counts = {name: sum(len(re.findall(expression, text)) for text in texts) for name, texts in found.items()}
+        rows.append(
+            (label, *(f"{count * 10_000 / max(words[name], 1):.1f} ({count})" for name, count in counts.items()))
+        )
+    return rows
+
+
 def main() -> None:
-    """Print the table."""
-    rows = table(Path(sys.argv[1]) if len(sys.argv) > 1 else PACKAGE)
-    for label, figure, anchor in [("", "here", "anchors"), *rows]:
+    """Print the tables."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else PACKAGE
+    for label, figure, anchor in [("", "here", "anchors"), *table(folder)]:
         print(f"{label:55} {figure:>14} {anchor:>12}")
+    print()
+    for label, *figures in [("comments, per 10,000 words", "Python", "C", "page"), *table_of_comments(folder)]:
+        print(f"{label:55} " + " ".join(f"{figure:>14}" for figure in figures))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* About and Locate (profile.md, "Firmware"): what runs on this board, and which of twenty it is. */
+/* About and Locate (profile.md, "Firmware"): the firmware on this board, and finding it among others. */
 #include "about.h"
 #include "clock.h"
 #include "inside.h"
@@ -53,7 +53,7 @@ int teds_about(teds_node *node, const teds_command *command, teds_origin *origin
     return length;
 }
 
-/* No claim and no write of flash; a new request replaces the one before. */
+/* Needs no claim and writes no flash; a new request replaces the previous one. */
 int teds_locate(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     const teds_port *port = node->port;

@@ -47,7 +47,7 @@ int teds_hash_transcript(teds_node *node, const uint8_t *request, const uint8_t 
     if (!teds_find(node, TEDS_SECURITY_ID, &source) || teds_source_hash(node, &source, teds) != 0) {
         return -TEDS_FAILURE;
     }
-    /* reply_head: nonceN, epoch, En as in the reply */
+    /* reply_head: nonceN, epoch and En, as in the reply. */
     const teds_part parts[] = {LABEL("TEDS1 transcript"), {request, REQUEST_OCTETS}, {reply_head, 85},
                                {node->identity.uuid, 10},          {node->identity.point, 65},         {teds, 32}};
     teds_sha256_parts(node, parts, sizeof parts / sizeof parts[0], out);
@@ -70,7 +70,7 @@ static int check_request(const teds_node *node, const uint8_t *payload)
     return node->state.epoch == UINT32_MAX ? -TEDS_WRONG_EPOCH : 0;
 }
 
-/* What a checked Request makes: the reply's 165 octets, and what pends. */
+/* Answer a checked Request: the reply's 165 octets, and the pending agreement. */
 static int answer_request(teds_node *node, const uint8_t *payload, uint8_t *out)
 {
     const teds_port *port = node->port;
@@ -137,7 +137,7 @@ int teds_confirm(teds_node *node, const teds_command *command, teds_origin *orig
     state = node->state;
     state.flags |= TEDS_KEYED;
     state.epoch = pending->epoch;
-    state.agreed = pending->agreed; /* its CA is the kept one, outside factory state: Request has seen to that */
+    state.agreed = pending->agreed; /* outside factory state, Request has checked that the CA stays the same */
 #if TEDS_OPERATION
     teds_make_all_safe(node);
 #endif

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Areas of flash, written once from front to back in whole units, with a CRC-32 at the end; reading them. What lies in an
- * area is the matter of identity.c and slots.c. */
+/* Areas of flash, written once from front to back in whole units, with a CRC-32 at the end; and reading them.
+ * identity.c and slots.c define the contents. */
 #include "area.h"
 #include "inside.h"
 

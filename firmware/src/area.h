@@ -6,9 +6,11 @@
 #include "inside.h"
 
 #define TEDS_UNIT_MOST 32u
-#define TEDS_FORM_AT 4u /* in identity and slots: what is before it, a slot's length and the CRC are the same in every form */
+/* offset of the form's version; the octets before it, a slot's length and the CRC are the same in every form */
+#define TEDS_FORM_AT 4u
 
-/* An area that is being written. Begin with port and area, the rest 0. A failure stays: look at it once, at the end. */
+/* An area that is being written. Set port and area, and the rest to 0. A failure is remembered: check it once, at the
+ * end. */
 typedef struct teds_writing {
     const teds_port *port;
     int area, failed;
@@ -21,12 +23,13 @@ void teds_area_put(teds_writing *into, const void *data, size_t length);
 /* Put zeros up to this offset. */
 void teds_area_pad(teds_writing *into, uint32_t until);
 
-/* Pad to `total`, whose last four octets are the CRC; return what failed on the way. */
+/* Pad to `total`, whose last four octets are the CRC; return any earlier failure. */
 int teds_area_close(teds_writing *into, uint32_t total);
 
 int teds_area_read(const teds_port *port, int area, uint32_t at, void *out, size_t length);
 
-/* Read the first `octets`: whether all of them are blank, because the rest of a torn slot may lie anywhere, and their CRC-32. */
+/* Read the first `octets` of an area: `blank` if all of them are (the rest of a torn slot may be anywhere), and their
+ * CRC-32. */
 int teds_area_scan(const teds_port *port, int area, uint32_t octets, bool *blank, uint32_t *crc);
 
 /* Compare the CRC-32 of the first `total` - 4 octets with the 4 that follow. */

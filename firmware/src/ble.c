@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* BLE (wire.md): commands and replies as frames `transaction 2, total 2, offset 2, piece` over two characteristics. The
- * GATT server, its connections and advertising are the chip's stack; when to advertise and which
- * connection to drop is decided here. */
+ * chip's stack provides the GATT server, connections and advertising; this file decides when to advertise and which
+ * connection to drop. */
 #include "ble.h"
 #include "clock.h"
 #include "drive.h"
@@ -100,7 +100,8 @@ void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value,
         return;
     }
     for (size_t i = 0; i < octets && offset + i < sizeof line->request; i++) {
-        line->request[offset + i] = value[HEAD + i]; /* what is longer than maxMessage gets 10, and not silence */
+        /* a message longer than maxMessage must get refusal 10, not silence */
+        line->request[offset + i] = value[HEAD + i];
     }
     line->held = (uint16_t)(offset + octets);
     if (line->held == total) {

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* CAN (wire.md): lines to stations, one long request at a time, replies, Identify asked of everyone, Announce and Claim,
- * and what leaves next. */
+/* CAN (wire.md): lines to stations, one long request at a time, replies, broadcasts, Announce and Claim, and the order
+ * of sending. */
 #include "can.h"
 #include "clock.h"
 #include "drive.h"
@@ -23,20 +23,21 @@
 #define CR_NS TEDS_SECOND
 #define REQUEST_NS (5u * TEDS_SECOND)
 #define MILLISECOND UINT64_C(1000000)
-/* A reply whose flow control is as late as this gives way to another station's request; a station's comes in 1 to 5 ms. */
+/* A reply that has waited so long for flow control gives way to another station's request; stations answer in 1 to 5
+ * ms. */
 #define PATIENT_NS (100 * MILLISECOND)
 #define MOST_OF_12_BITS 4095u
 #define LONGEST_SILENCE UINT64_C(30) /* s */
-#define EVERYONE_NS 50000000u
+#define SPREAD_NS 50000000u
 #define START_NS 500000000u
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
 #define A_MINUTE (60u * TEDS_SECOND >> UNIT_BITS)
-/* Presses: ten at once and one each 6 s, so 20 in any minute. */
+/* A pressed button: ten Announces at once and one more each 6 s, so 20 in any minute. */
 #define PRESSES_APART ((TEDS_SECOND >> UNIT_BITS) + 2)
 #define PRESS_UNITS (A_MINUTE / 10)
 #define PRESSES_PAID (A_MINUTE - PRESS_UNITS)
 #define MOVES_AT_ONCE 3u
-#define QUIET_NS (600u * TEDS_SECOND) /* without a conflict: moves are immediate again */
+#define QUIET_NS (600u * TEDS_SECOND) /* without a conflict for so long, moves are immediate again */
 #define LONGEST_STAY UINT64_C(60)     /* s */
 
 static bool is_sending(const teds_line *line)
@@ -44,8 +45,8 @@ static bool is_sending(const teds_line *line)
     return line->out_state != TEDS_OUT_IDLE;
 }
 
-/* A random wait of up to `most` ns. While the chip has no randomness it follows from the UUID: nodes that start together
- * must not speak together. */
+/* A random wait of up to `most` ns. While the chip has no randomness it is derived from the UUID: nodes that start
+ * together must not send at the same time. */
 static uint32_t draw_wait(const teds_node *node, uint32_t most)
 {
     uint8_t octets[2];
@@ -58,7 +59,7 @@ static uint32_t draw_wait(const teds_node *node, uint32_t most)
 
 /* -- lines --------------------------------------------------------------------------------------------------------- */
 
-/* A message has left, or was given up. */
+/* Handle a message that was sent or abandoned. */
 static void finish_message(teds_node *node, teds_line *line)
 {
     line->out_state = TEDS_OUT_IDLE;
@@ -70,15 +71,15 @@ static void finish_message(teds_node *node, teds_line *line)
     teds_node_reply_left(node, line->source);
 }
 
-/* An answer to everyone whose flow control has not come gives way to whatever else is asked. */
+/* A broadcast answer that waits for flow control gives way to any other command. */
 static bool gives_way(const teds_line *line)
 {
     return line->out_reply == NULL && line->out_state == TEDS_OUT_WAITS;
 }
 
-/* How readily a line is left to another station. A session's own never is, so that what strangers ask takes no place that
- * a pair with a session needs; nor is that of the long request that is coming in. */
-enum { AT_REST, OF_EVERYONE, OF_A_REPLY, NOT_TO_BE_HAD };
+/* How easily another station may take a line. Never that of a session, so that strangers cannot take a place that a
+ * pair with a session needs; nor that of the long request being received. */
+enum { AT_REST, OF_A_BROADCAST, OF_A_REPLY, NOT_AVAILABLE };
 
 static unsigned rank_line(teds_node *node, const teds_line *line, uint64_t now)
 {
@@ -86,24 +87,25 @@ static unsigned rank_line(teds_node *node, const teds_line *line, uint64_t now)
         return AT_REST;
     }
     if (node->can.rx_line == line || teds_session_on(node, line->source) != NULL) {
-        return NOT_TO_BE_HAD;
+        return NOT_AVAILABLE;
     }
     if (!is_sending(line)) {
-        return line->asked ? OF_EVERYONE : AT_REST;
+        return line->asked ? OF_A_BROADCAST : AT_REST;
     }
     if (gives_way(line)) {
-        return OF_EVERYONE;
+        return OF_A_BROADCAST;
     }
     return line->out_state == TEDS_OUT_WAITS && line->out_due + PATIENT_NS <= now + TEDS_N_BS ? OF_A_REPLY
-                                                                                              : NOT_TO_BE_HAD;
+                                                                                              : NOT_AVAILABLE;
 }
 
-/* A station's line; the most readily left one, and of these the one not used for longest. `most`: what may be taken.
- * NULL: none is to be had, or the node has moved by giving a reply up. */
+/* Find a station's line; otherwise the one that is easiest to take, and of equal ones the least recently used. `most`:
+ * the limit of what may be taken. NULL: none may be taken, or the node moved to another address when it abandoned a
+ * reply. */
 static teds_line *find_line(teds_node *node, uint8_t source, unsigned most, uint64_t now)
 {
     const uint8_t own = node->can.address;
-    unsigned best = NOT_TO_BE_HAD;
+    unsigned best = NOT_AVAILABLE;
     teds_line *found = NULL;
     node->can.touches++;
     for (teds_line *each = node->lines; each < node->lines + TEDS_CAN_LINES; each++) {
@@ -113,7 +115,7 @@ static teds_line *find_line(teds_node *node, uint8_t source, unsigned most, uint
             return each;
         }
         held = rank_line(node, each, now);
-        if (held <= most && (held < best || (held == best && each->touched < found->touched))) { /* 0: not used */
+        if (held <= most && (held < best || (held == best && each->touched < found->touched))) { /* source 0: unused */
             found = each;
             best = held;
         }
@@ -131,7 +133,7 @@ static teds_line *find_line(teds_node *node, uint8_t source, unsigned most, uint
     return found;
 }
 
-/* Two nodes under one address drive each other off the bus: a second of silence, doubling to half a minute. */
+/* Two nodes at one address drive each other off the bus: stay silent for a second, doubling to half a minute. */
 static void keep_silent(teds_can *can, uint64_t now)
 {
     if (now < can->back_at) {
@@ -149,7 +151,7 @@ void teds_node_bus_off(teds_node *node)
     teds_can_links_forget(node);
     keep_silent(&node->can, teds_now(node));
     node->can.announces = node->can.pressed = false;
-    if (node->can.moves_to != 0) { /* no reply leaves any more */
+    if (node->can.moves_to != 0) { /* the reply will not be sent any more */
         teds_address_move(node, node->can.moves_to);
     }
 #if TEDS_MANAGED
@@ -161,7 +163,7 @@ void teds_node_bus_off(teds_node *node)
 
 /* -- requests ------------------------------------------------------------------------------------------------------ */
 
-/* A refusal in place of a flow control or of a reply, as one frame; the stored reply stays. */
+/* Send a refusal in place of flow control or a reply, as one frame; the stored reply is kept. */
 static void refuse_request(teds_line *line, uint8_t transaction, uint8_t reason, bool fd)
 {
     line->refuses = reason;
@@ -171,14 +173,15 @@ static void refuse_request(teds_line *line, uint8_t transaction, uint8_t reason,
     }
 }
 
-/* When a request that begins now has to be whole: 5 s, and what our own STmin takes. */
+/* The time by which a request that begins now must be complete: 5 s, plus our own STmin for each frame. */
 static uint64_t find_end(size_t length, size_t octets_of_frame, uint64_t now)
 {
     return now + REQUEST_NS + (uint64_t)(length / (octets_of_frame - 1)) * teds_isotp_gap(TEDS_CAN_STMIN);
 }
 
-/* The reason to refuse a long request of this line because another one is coming in; 0: it is taken. A pair with a
- * session goes before a stranger, and the pair that holds the place begins no other request in it while another waits. */
+/* Return the reason to refuse a long request of this line because another one is being received; 0: accept it. A pair
+ * with a session takes precedence over a stranger. The pair that holds the buffer may not begin another request in it
+ * while another pair waits. */
 static uint8_t check_reception(teds_node *node, const teds_line *line, uint64_t now)
 {
     teds_can *can = &node->can;
@@ -207,10 +210,10 @@ static void run_can_request(teds_node *node, teds_line *line, const uint8_t *bod
     const teds_arrival arrival = {TEDS_CAN, !teds_has_nfc(node) && teds_in_factory(node), fd, tick};
     const uint8_t own = line->own;
     teds_stored_reply *reply;
-    if (is_sending(line)) { /* a station that asks again has not taken that answer up */
+    if (is_sending(line)) { /* a new request shows that the station no longer wants the reply */
         finish_message(node, line);
         if (line->source == 0 || line->own != own) {
-            return; /* the node has moved: the old address does not answer */
+            return; /* the node has moved, and the old address does not answer */
         }
     }
     reply = teds_answer(node, line->source, &arrival, body, 1, body + 1, length - 1);
@@ -231,19 +234,20 @@ static void take_first_frame(teds_node *node, teds_line *line, const teds_can_fr
     if (frame->length < 8) {
         return;
     }
-    if (length == 0) { /* in 32 bits: more than 4095 octets, else it is ignored (ISO 15765-2) */
+    if (length == 0) { /* the length is in 32 bits: more than 4095 octets, otherwise ignored (ISO 15765-2) */
         length = teds_get32(frame->data + 2);
         head = 6;
         if (length <= MOST_OF_12_BITS) {
             return;
         }
     } else if (length < (frame->length > 8 ? frame->length - 1u : 8u)) {
-        return; /* would fit one frame: not to be answered (FF_DLmin of ISO 15765-2) */
+        return; /* it would fit one frame, so it is ignored (FF_DLmin of ISO 15765-2) */
     }
     if (gives_way(line)) {
-        line->out_state = TEDS_OUT_IDLE; /* which leaves the line free to answer in the form of this frame */
+        line->out_state = TEDS_OUT_IDLE; /* so that the line may answer in the form (classic, FD) of this frame */
     }
-    if (length > sizeof node->rx) { /* always so of a length in 32 bits; what is taken is longer than its first frame */
+    /* always true for a 32-bit length; an accepted request is longer than its first frame */
+    if (length > sizeof node->rx) {
         reason = TEDS_TOO_LARGE;
     } else {
         reason = check_reception(node, line, now);
@@ -278,10 +282,10 @@ static void take_consecutive_frame(teds_node *node, teds_line *line, const teds_
         return;
     }
     if (number == ((can->rx_number + 15u) & 15u) && can->rx_at > 8) {
-        return; /* the same frame twice: an error in its last bit doubles a frame on CAN */
+        return; /* the same frame twice: CAN repeats a frame after an error in its last bit */
     }
     if (frame->length > first || (frame->length < first && frame->length - 1u < octets)) {
-        return; /* only the last may be shorter than the first frame, none longer: ignored (ISO 15765-2) */
+        return; /* only the last frame may be shorter than the first, none longer; others are ignored (ISO 15765-2) */
     }
     octets = octets < frame->length - 1u ? octets : frame->length - 1u;
     if (number != can->rx_number || now >= can->rx_until || octets == 0) {
@@ -302,7 +306,7 @@ static void take_consecutive_frame(teds_node *node, teds_line *line, const teds_
     }
 }
 
-/* A station for which there is no line: what it asks gets 17, which needs none. */
+/* Refuse a station for which there is no line, with 17: a refusal needs no line. */
 static void turn_station_away(teds_node *node, const teds_can_frame *frame, uint8_t source)
 {
     const uint8_t *body = frame->data + 2;
@@ -332,7 +336,7 @@ static void take_physical(teds_node *node, const teds_can_frame *frame, uint64_t
     case 0:
         if (teds_isotp_single(frame->data, frame->length, &body, &octets)) {
             if (node->can.rx_line == line) {
-                node->can.rx_line = NULL; /* a new message of the same station ends the one before */
+                node->can.rx_line = NULL; /* a new message of a station replaces its previous one */
             }
             run_can_request(node, line, body, octets, frame->fd, tick);
         }
@@ -344,7 +348,7 @@ static void take_physical(teds_node *node, const teds_can_frame *frame, uint64_t
     }
 }
 
-/* -- everyone ------------------------------------------------------------------------------------------------------ */
+/* -- broadcasts ---------------------------------------------------------------------------------------------------- */
 
 static void take_functional(teds_node *node, const teds_can_frame *frame, uint64_t now)
 {
@@ -354,38 +358,38 @@ static void take_functional(teds_node *node, const teds_can_frame *frame, uint64
     teds_line *line;
     if (!teds_isotp_single(frame->data, frame->length, &body, &octets) || octets != 7 ||
         memcmp(body + 1, identify, 6) != 0) {
-        return; /* nothing else that is asked of everyone is answered */
+        return; /* no other command is answered to a broadcast */
     }
-    line = find_line(node, (uint8_t)frame->identifier, OF_EVERYONE, now);
-    if (line != NULL) { /* a newer one of the same station takes its place */
+    line = find_line(node, (uint8_t)frame->identifier, OF_A_BROADCAST, now);
+    if (line != NULL) { /* a newer broadcast of the same station replaces the waiting one */
         line->asked = true;
         line->asked_transaction = body[0];
         line->asked_fd = TEDS_CAN_FD && frame->fd;
-        line->asked_due = now + draw_wait(node, EVERYONE_NS);
+        line->asked_due = now + draw_wait(node, SPREAD_NS);
     }
 }
 
-/* It gives way to the next. */
-static bool may_answer_everyone(const teds_line *line)
+/* The answer gives way to the next message. */
+static bool may_answer_broadcast(const teds_line *line)
 {
     return !is_sending(line) || gives_way(line);
 }
 
-/* It leaves the stored reply alone. The octets are those of every line: the transaction leaves with the first frame, now,
- * and what is under way ends when the rest changes (end_old_answers). */
-static void answer_everyone(teds_node *node, teds_line *line)
+/* Answer a broadcast without touching the stored reply. All lines share the octets: the transaction is sent with the
+ * first frame, now, and answers in progress are ended when the rest changes (end_old_answers). */
+static void answer_broadcast(teds_node *node, teds_line *line)
 {
-    uint8_t *octets = node->can.everyone;
+    uint8_t *octets = node->can.broadcast_answer;
     line->asked = false;
     octets[0] = line->asked_transaction;
     octets[1] = 1;
     teds_put16(octets + 2, 23);
     teds_node_identify(node, octets + 4);
     line->out_reply = NULL;
-    teds_isotp_begin(line, octets, sizeof node->can.everyone, TEDS_CAN_FD && line->asked_fd);
+    teds_isotp_begin(line, octets, sizeof node->can.broadcast_answer, TEDS_CAN_FD && line->asked_fd);
 }
 
-/* The reply to Identify has changed since: broadcast replies that are under way end. */
+/* The reply to Identify has changed: end the broadcast answers in progress. */
 static void end_old_answers(teds_node *node)
 {
     if (!node->identity_changed) {
@@ -412,7 +416,7 @@ void teds_can_start(teds_node *node, uint64_t now)
     plan_announce(node, now > node->can.back_at ? now : node->can.back_at, START_NS);
 }
 
-/* The next address at which no node was heard; this one if every other is taken. */
+/* The next address at which no node was heard; this node's own if all others are in use. */
 static uint8_t find_free_address(const teds_node *node)
 {
     const uint8_t own = node->can.address;
@@ -423,7 +427,7 @@ static uint8_t find_free_address(const teds_node *node)
     return address;
 }
 
-/* With an actuator claimed a node keeps its address and goes on announcing. */
+/* While an actuator is claimed, the node keeps its address and continues to announce it. */
 static bool keeps_address(const teds_node *node)
 {
 #if TEDS_OPERATION
@@ -442,7 +446,7 @@ static void give_up_address(teds_node *node, uint64_t now)
         node->can.moves = (uint8_t)(node->can.moves < UINT8_MAX ? node->can.moves + 1 : UINT8_MAX);
         teds_address_move(node, find_free_address(node));
     }
-    plan_announce(node, now, EVERYONE_NS);
+    plan_announce(node, now, SPREAD_NS);
 }
 
 static void take_announce(teds_node *node, const teds_can_frame *frame, uint64_t now)
@@ -451,23 +455,24 @@ static void take_announce(teds_node *node, const teds_can_frame *frame, uint64_t
     uint8_t address = (uint8_t)frame->identifier;
     uint32_t crc, own;
     if (address != node->can.address || frame->length != 8 || frame->data[0] != 1 || frame->data[1] > 2 ||
-        frame->data[6] == 1) { /* a pressed button claims nothing */
+        frame->data[6] == 1) { /* a pressed button claims no address */
         return;
     }
     crc = teds_get32(frame->data + 2);
     own = teds_uuid_crc(node);
     if (crc == own) {
-        return; /* a conflict for a person, or our own frame given back */
+        return; /* the same UUID twice, which the operator must resolve, or an echo of our own frame */
     }
     if (can->conflict_at != 0 && now - can->conflict_at >= QUIET_NS) {
         can->moves = 0;
     }
     can->conflict_at = now;
     if (crc > own || keeps_address(node)) {
-        plan_announce(node, now, EVERYONE_NS);
+        plan_announce(node, now, SPREAD_NS);
     } else if (can->moves < MOVES_AT_ONCE) {
         give_up_address(node, now);
-    } else if (!can->gives_up) { /* an Announce proves nothing, and each move ends the sessions here */
+    } else if (!can->gives_up) {
+        /* An Announce is not authenticated, and each move ends the sessions here: delay it. */
         const unsigned doublings = can->moves - MOVES_AT_ONCE;
         can->gives_up = true;
         can->move_at = now + (doublings < 6 ? UINT64_C(1) << doublings : LONGEST_STAY) * TEDS_SECOND;
@@ -570,7 +575,7 @@ static void put_refusal(teds_can_frame *frame, uint8_t transaction, uint8_t reas
     teds_can_pad(frame, 6);
 }
 
-/* What a line has to send now, flow controls first: a station waits for them. */
+/* The next frame of a line. Flow control first, because a station waits for it. */
 static bool next_line_frame(teds_node *node, teds_line *line, teds_can_frame *frame, uint64_t now)
 {
     frame->identifier = PHYSICAL | (uint32_t)line->source << 8 | line->own;
@@ -583,8 +588,8 @@ static bool next_line_frame(teds_node *node, teds_line *line, teds_can_frame *fr
         line->refuses = 0;
         return true;
     }
-    if (line->asked && now >= line->asked_due && may_answer_everyone(line)) {
-        answer_everyone(node, line);
+    if (line->asked && now >= line->asked_due && may_answer_broadcast(line)) {
+        answer_broadcast(node, line);
     }
     if (!is_sending(line) || !teds_isotp_next(line, frame, now)) {
         return false;
@@ -656,12 +661,12 @@ uint64_t teds_can_poll(teds_node *node, uint64_t now)
     }
     for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
         if (line->out_state == TEDS_OUT_WAITS && now >= line->out_due) {
-            finish_message(node, line); /* its flow control failed to come */
+            finish_message(node, line); /* no flow control came */
         }
         if (is_sending(line)) {
             teds_sooner(&due, line->out_due);
         }
-        if (line->asked && may_answer_everyone(line)) {
+        if (line->asked && may_answer_broadcast(line)) {
             teds_sooner(&due, line->asked_due);
         }
         if (line->flow != 0 || line->refuses != 0) {

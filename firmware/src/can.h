@@ -5,7 +5,7 @@
 
 #include "inside.h"
 
-/* Give up what waits too long; return when the next thing is due. */
+/* Abandon what has waited too long; return the time of the next action. */
 uint64_t teds_can_poll(teds_node *node, uint64_t now);
 
 #endif

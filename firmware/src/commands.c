@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Commands: which may be run when (security-teds.md, 4), routing, and the commands that need little. */
+/* Commands: permission (security-teds.md, 4), routing, and the short handlers. */
 #include "commands.h"
 #include "about.h"
 #include "agree.h"
@@ -22,9 +22,10 @@
 #define ADDRESS_NS (10u * TEDS_SECOND)
 #define STRANGER_NS TEDS_SECOND
 
-/* -- permission: the first question asked of a command ------------------------------------------------------------- */
+/* -- permission: checked first for each command -------------------------------------------------------------------- */
 
-/* Commands, in the order of their names in the profile; ANY length if the handler asks for it in its own order. */
+/* Commands, in the order of their names in the profile. ANY length: the handler checks it, in its own order of checks.
+ * */
 #define ANY 255u
 typedef struct known {
     uint8_t command_class, function, length;
@@ -34,7 +35,7 @@ typedef struct known {
 static teds_handler run_identify, run_prove, run_reset, run_set_can_address, run_list, run_close;
 
 static const known KNOWN[] = {
-    {TEDS_CLASS_SECURITY, TEDS_IDENTIFY, 0, run_identify}, /* asked most */
+    {TEDS_CLASS_SECURITY, TEDS_IDENTIFY, 0, run_identify}, /* first, as the most frequent one */
     {TEDS_CLASS_COMMON, TEDS_QUERY, 1, teds_query},
     {TEDS_CLASS_COMMON, TEDS_READ, 5, teds_read},
     {TEDS_CLASS_COMMON, TEDS_WRITE, ANY, teds_write},
@@ -52,7 +53,7 @@ static const known KNOWN[] = {
 #if TEDS_MANAGED
     {TEDS_CLASS_SECURITY, TEDS_MANAGE, ANY, teds_manage},
 #endif
-#if TEDS_OPERATION /* from here on those of operation.md */
+#if TEDS_OPERATION /* commands of operation.md from here on */
     {TEDS_CLASS_SECURITY, TEDS_SAMPLE, ANY, teds_sample},
     {TEDS_CLASS_SECURITY, TEDS_SET, ANY, teds_set},
     {TEDS_CLASS_SECURITY, TEDS_SUBSCRIBE, ANY, teds_subscribe},
@@ -69,9 +70,9 @@ static const known KNOWN[] = {
     {TEDS_CLASS_COMMON, TEDS_SELF_TEST, ANY, teds_self_test},
 #endif
 };
-#define MEASURES (TEDS_MANAGED ? 16u : 15u) /* place of the first of operation.md */
+#define MEASURES (TEDS_MANAGED ? 16u : 15u) /* index of the first command of operation.md */
 
-/* NULL: no such command here. A board without channels offers none of operation.md. */
+/* NULL: unknown command. A board without channels has none of operation.md. */
 static const known *find_known(const teds_node *node, const teds_command *command)
 {
     const size_t count = node->port->channel_count > 0 ? sizeof KNOWN / sizeof KNOWN[0] : MEASURES;
@@ -83,7 +84,8 @@ static const known *find_known(const teds_node *node, const teds_command *comman
     return NULL;
 }
 
-/* No stranger's point arithmetic may hold up the values of a claimed actuator. */
+/* While an actuator is claimed, refuse strangers' commands that need slow point arithmetic: they would delay its
+ * values. */
 static int spare_actuators(const teds_node *node)
 {
 #if TEDS_OPERATION
@@ -96,7 +98,8 @@ static int spare_actuators(const teds_node *node)
     return 0;
 }
 
-/* While a stream runs, plain Read, List and About beyond one a second get 17, together and over all links. */
+/* While a stream runs, plain Read, List and About are limited to one a second, over all links together; others get 17.
+ * */
 static int hold_strangers_back(teds_node *node)
 {
 #if TEDS_OPERATION
@@ -128,7 +131,7 @@ static int permit_plain_security(teds_node *node, const teds_command *command, c
     case TEDS_SEALED:
         return !teds_in_factory(node) && teds_any_on(node, origin->link) ? 0 : -TEDS_WRONG_STATE;
     case TEDS_IDENTIFY: return 0;
-    case TEDS_ABOUT: /* by radio a board with a key would be recognised by it */
+    case TEDS_ABOUT: /* over radio, it would identify a board that has a key */
         if (!teds_in_factory(node) && origin->arrival->kind != TEDS_CAN) {
             return -TEDS_NOT_PERMITTED;
         }
@@ -137,7 +140,7 @@ static int permit_plain_security(teds_node *node, const teds_command *command, c
     case TEDS_RESET:
     case TEDS_LOCATE: return teds_in_factory(node) ? 0 : -TEDS_NOT_PERMITTED;
     case TEDS_LIST: return hold_strangers_back(node);
-    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */
+    default: return -TEDS_NOT_PERMITTED; /* Close, and the commands of operation.md */
     }
 }
 
@@ -188,7 +191,7 @@ static int permit_command(teds_node *node, const teds_command *command, const te
     return refused;
 }
 
-/* -- class 128, the small ones ------------------------------------------------------------------------------------- */
+/* -- class 128: short handlers ------------------------------------------------------------------------------------- */
 
 static int run_identify(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
@@ -258,7 +261,7 @@ static int run_set_can_address(teds_node *node, const teds_command *command, ted
         }
         node->address_again = now + ADDRESS_NS;
     }
-    node->can.moves_to = command->payload[0]; /* when the reply has left */
+    node->can.moves_to = command->payload[0]; /* once the reply has been sent */
     node->can.moves_link = origin->link;
     return 0;
 }
@@ -306,19 +309,19 @@ static int parse_command(teds_node *node, const uint8_t *frame, size_t length, c
                : -TEDS_BAD_FORM;
 }
 
-/* A command that is permitted and whose length is right, other than Sealed. */
+/* Run a permitted command of the right length, other than Sealed. */
 static int run_command(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
 #if TEDS_OPERATION
     if (command->known >= KNOWN + MEASURES) {
-        /* what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop */
+        /* First end expired leases and dead-men, and take samples that are due, for example before a Stop. */
         (void)teds_operation_poll(node, teds_now(node));
     }
 #endif
     return command->known->run(node, command, origin, out);
 }
 
-/* The reply frame around a handler's outcome, whose payload is at reply + 3. */
+/* Complete the reply frame of a handler, whose payload is at reply + 3. */
 static size_t close_reply(uint8_t *reply, int outcome)
 {
     reply[0] = outcome >= 0;
@@ -339,8 +342,8 @@ static void end_after_reply(teds_node *node, const teds_origin *origin)
     }
 }
 
-/* The payload of Sealed's reply at `out`. The inner command is deciphered to the end of the reply's own room, which
- * no one reads any more; its reply grows from the front. */
+/* Write the payload of Sealed's reply to `out`. The inner command is decrypted into the end of the reply buffer, which
+ * is free by then; the inner reply grows from its front. */
 static int run_sealed(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     teds_taken taken = {0};
@@ -349,7 +352,8 @@ static int run_sealed(teds_node *node, const teds_command *command, teds_origin 
     size_t length;
     int outcome;
 #if TEDS_OPERATION
-    (void)teds_operation_poll(node, teds_now(node)); /* a lease that ran out before is over: this does not revive it */
+    /* expired leases end first, so that this command cannot renew them */
+    (void)teds_operation_poll(node, teds_now(node));
 #endif
     outcome = teds_take_sealed(node, origin->link, origin->arrival, command->payload, command->length, inner, &taken);
     if (outcome) {

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The commit of a datasheet (security-teds.md, 5): every check in its order, then one transaction; and the way back to
- * factory state. */
+/* The commit of a datasheet (security-teds.md, 5): all checks in order, then one transaction; and the return to factory
+ * state. */
 #include "commit.h"
 #include "crypto.h"
 #include "datasheet.h"

@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Hashes, keys and signatures over the port's primitives (profile.md, "Cryptography"). Nothing here knows a command.
- *
- * NIST SP 800-56A ECC CDH over one-time keys, HKDF of RFC 5869; the node's identity key only signs. */
+/* Hashes, keys and signatures over the port's primitives (profile.md, "Cryptography"); this file knows no commands.
+ * NIST SP 800-56A ECC CDH with one-time keys, HKDF of RFC 5869; the node's identity key is only used to sign. */
 #include "crypto.h"
 #include "inside.h"
 
@@ -28,7 +27,7 @@ int teds_hkdf_expand(const teds_node *node, const uint8_t prk[32], const teds_pa
     for (size_t i = 0; i < count; i++) {
         parts[1 + i] = info[i];
     }
-    parts[0] = (teds_part){block, 0}; /* the block before, from the second on */
+    parts[0] = (teds_part){block, 0}; /* from the second round on, the previous block */
     parts[1 + count] = (teds_part){&number, 1};
     for (size_t at = 0; at < length && !failed; at += 32) {
         failed = node->port->hmac(node->port->user, prk, 32, parts, count + 2, block);

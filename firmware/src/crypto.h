@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Hashes, keys and signatures: what the profile makes of the port's primitives. A part is octets and their number;
- * functions that take parts work on them one after another. int: 0, or the port failed. */
+/* Hashes, keys and signatures of the profile, from the port's primitives. A part is octets and their number; functions
+ * that take parts process them in order. int: 0, or the port failed. */
 #ifndef TEDS_SRC_CRYPTO_H
 #define TEDS_SRC_CRYPTO_H
 
@@ -24,10 +24,11 @@ int teds_hkdf(const teds_node *node, const uint8_t salt[16], const teds_part *pa
 int teds_mac(const teds_node *node, const uint8_t *key, size_t key_length, const teds_part *parts, size_t count,
              uint8_t out[16]);
 
-/* True for a point of P-256 that is not the node's own: no station may show the node its own key. */
+/* True for a point of P-256 other than the node's own: no station may use the node's own key. */
 bool teds_point_good(const teds_node *node, const uint8_t point[65]);
 
-/* Signatures are over the SHA-256 of the parts, and s is the lower half, so that each has one form only. */
+/* Signatures are over the SHA-256 of the parts, with s in the lower half of the order, so that each has only one form.
+ * */
 bool teds_verify(const teds_node *node, const uint8_t point[65], const teds_part *parts, size_t count,
                  const uint8_t signature[64]);
 
@@ -41,7 +42,7 @@ int teds_sign(const teds_node *node, const teds_part *parts, size_t count, uint8
 /* Make the one-time key of the next Request or Open, unless teds_idle_work made it ahead. */
 int teds_one_time_make(teds_node *node);
 
-/* Wipe it: after its one use, whatever came of that. */
+/* Wipe the one-time key: after its one use, whatever the result. */
 void teds_one_time_drop(teds_node *node);
 
 #endif

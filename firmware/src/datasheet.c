@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Which TEDS the node has now: fixed by the firmware, stored in the slot that counts, or the initial Security TEDS; and
- * which it would have after a commit. */
+/* The TEDS that the node has now: fixed by the firmware, stored in the current slot, or the initial Security TEDS; and
+ * those that it would have after a commit. */
 #include "datasheet.h"
 #include "slots.h"
 #include "staging.h"

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Drive (operation.md, 4 and 6): values for actuators by message, without a reply. Whatever is wrong with a message, it is
- * dropped without a word; a good tag uses its counter up all the same. */
+/* Drive (operation.md, 4 and 6): values for actuators by message, without a reply. A message with any error is dropped
+ * silently; with a good tag it uses up its counter anyway. */
 #include "drive.h"
 #include "clock.h"
 #include "isotp.h"
@@ -65,7 +65,7 @@ int teds_drive(teds_node *node, const teds_command *command, teds_origin *origin
     return 4;
 }
 
-/* Neither past (which shows as far ahead, mod 2^32) nor further ahead than the shortest dead-man. */
+/* `until` must not be in the past (which looks far ahead, mod 2^32) nor further ahead than the shortest dead-man. */
 static bool is_in_time(const teds_node *node, const teds_session *session, uint32_t until)
 {
     uint32_t ahead = until - (uint32_t)(teds_now(node) / MICRO);
@@ -104,7 +104,7 @@ static void take_drive_message(teds_node *node, teds_session *session)
     }
 }
 
-/* The length of a CAN FD frame that holds so many octets. */
+/* The length of a CAN FD frame that can hold so many octets. */
 static size_t round_to_fd(size_t octets)
 {
     teds_can_frame frame = {0};
@@ -121,7 +121,7 @@ void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, 
     if (session == NULL) {
         return;
     }
-    (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this message is over */
+    (void)teds_operation_poll(node, teds_now(node)); /* end dead-men that expired before this message */
     if (session->drive.used && length == drive_octets(session)) {
         memcpy(session->drive.message, octets, length);
         take_drive_message(node, session);
@@ -135,7 +135,7 @@ void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, si
     if (session == NULL || length < 1 || octets[0] > 7) {
         return;
     }
-    (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this frame is over */
+    (void)teds_operation_poll(node, teds_now(node)); /* end dead-men that expired before this frame */
     if (!session->drive.used) {
         return;
     }

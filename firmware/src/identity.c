@@ -1,12 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Who the node is: its UUID and identity key, made at the very first start and never changed, and what Identify and
- * Announce answer. */
+/* The node's identity: its UUID and identity key, made at the very first start and never changed, and the answers to
+ * Identify and Announce. */
 #include "identity.h"
 #include "area.h"
 #include "crypto.h"
 #include "inside.h"
 
-/* identity area: magic 4, version 1, 0 0 0, UUID 10, key 32, point 65, field 102 64, zeros, CRC-32 in the last 4 */
+/* Identity area: magic 4, version 1, 0 0 0, UUID 10, key 32, point 65, field 102 64, zeros; the last 4 octets are the
+ * CRC-32. */
 #define IDENTITY_OCTETS 192u
 static const uint8_t IDENTITY_MAGIC[8] = {'T', 'I', 'D', 'N', 1, 0, 0, 0};
 
@@ -46,7 +47,8 @@ static int read_identity(teds_node *node, bool *good)
     return 0;
 }
 
-/* A torn identity is no one's while both slots are blank: the first start writes a slot before the node shows its key. */
+/* A torn identity may be erased while both slots are blank: the first start writes a slot before the node shows its
+ * key. */
 static int forget_torn_identity(const teds_port *port)
 {
     for (int area = TEDS_SLOT_A; area <= TEDS_SLOT_B; area++) {
@@ -85,10 +87,10 @@ int teds_identity_load(teds_node *node)
     if (!failed) {
         failed = read_identity(node, &good);
     }
-    return failed || good ? failed : TEDS_E_FLASH; /* it does not read back as it was written just now */
+    return failed || good ? failed : TEDS_E_FLASH; /* what was just written does not read back */
 }
 
-/* -- what it answers ----------------------------------------------------------------------------------------------- */
+/* -- identity and address as reported ------------------------------------------------------------------------------ */
 
 uint32_t teds_uuid_crc(const teds_node *node)
 {

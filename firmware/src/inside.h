@@ -1,15 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The words that all of src/ shares: reasons, commands, where a command came from. Not for boards.
+/* Names that all of src/ shares: reasons, commands, the origin of a command. Not for boards.
  *
- * Handlers have the names of their commands (teds_request, teds_sample); other shared functions begin with what they are
- * about (teds_session_end, teds_slots_write). Includes point one way; README.md lists the sources from the bottom up. */
+ * Handlers have the names of their commands (teds_request, teds_sample); other shared functions begin with their
+ * subject (teds_session_end, teds_slots_write). Includes go one way; README.md lists the sources from the bottom up. */
 #ifndef TEDS_INSIDE_H
 #define TEDS_INSIDE_H
 
 #include "octets.h"
 #include "teds/node.h"
 
-/* Why a node refuses (security-teds.md 4, operation.md 8). Handlers give octets of payload, or a reason negated. */
+/* Reasons of refusals (security-teds.md 4, operation.md 8). Handlers return octets of payload, or a reason negated. */
 enum {
     TEDS_UNKNOWN_COMMAND = 1,
     TEDS_WRONG_STATE = 2,
@@ -76,7 +76,7 @@ enum { TEDS_QUERY = 1, TEDS_READ = 2, TEDS_WRITE = 3, TEDS_UPDATE = 4, TEDS_SELF
 #define TEDS_SECURITY_ID 0x0080u /* channel 0, access code 128 */
 #define TEDS_INITIAL_OCTETS 237u
 #define TEDS_OPEN_OCTETS 89u /* keyId, Es, mac */
-/* Payload that a reply in a session carries: headers, counter, tag and the longest padding taken off. */
+/* Payload that fits into a reply in a session: less headers, counter, tag and the longest padding. */
 #define TEDS_ROOM (TEDS_MAX_MESSAGE - 42u)
 
 typedef struct teds_command {
@@ -87,25 +87,25 @@ typedef struct teds_command {
     const struct known *known; /* in the table of commands.c; NULL: Sealed */
 } teds_command;
 
-/* What is to end when the reply is made. */
+/* What ends after the reply was made. */
 enum { TEDS_AFTER_NOTHING, TEDS_AFTER_END_SESSION, TEDS_AFTER_END_ALL };
 
 typedef struct teds_origin {
     teds_link link;
     const teds_arrival *arrival;
-    teds_session *session; /* NULL: outside */
+    teds_session *session; /* NULL: outside a session */
     uint8_t after;
 } teds_origin;
 
-/* Runs a command whose length and permission are right: the reply's payload goes to `out`, its length or a reason
- * negated is given. */
+/* Runs a command whose length and permission were checked: writes the reply's payload to `out`, and returns its length
+ * or a reason negated. */
 typedef int teds_handler(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out);
 
 static inline bool teds_has_nfc(const teds_node *node)
 {
     return TEDS_NFC && node->config->nfc.present;
 }
-/* The boot loader reverts the running image unless it is confirmed: what is stored stays as it is. */
+/* True if the boot loader will revert the running image unless it is confirmed: stored data must not change. */
 static inline bool teds_on_trial(const teds_node *node)
 {
     return TEDS_MANAGED && (node->firmware & TEDS_FIRMWARE_ON_TRIAL) != 0;

@@ -1,9 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* ISO 15765-2 for one pair of addresses: cutting a message into frames, flow control. No CAN identifiers here.
- *
- * Its own 2 KB instead of an operating system's: the profile wants a reply for each pair of addresses, refusals from a
- * first frame, and frames that can be taken back.
- */
+/* ISO 15765-2 for one pair of addresses: segmentation of messages and flow control, without CAN identifiers. Written
+ * here (2 KB) instead of using an operating system's: the profile needs a reply per pair of addresses, refusals after a
+ * first frame, and frames that can be withdrawn. */
 #include "isotp.h"
 #include "inside.h"
 
@@ -36,7 +34,7 @@ void teds_isotp_begin(teds_line *line, const uint8_t *octets, size_t length, boo
 
 static void put_first_frame(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
-    const bool fd = TEDS_CAN_FD && line->fd; /* known to the compiler if only classic frames are built */
+    const bool fd = TEDS_CAN_FD && line->fd; /* a constant if only classic frames are compiled in */
     const size_t room = fd ? 64 : 8, most_single = fd ? 62 : 7;
     size_t at;
     if (line->out_length <= most_single) {
@@ -118,7 +116,7 @@ void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64
         line->out_waits++;
         line->out_due = now + TEDS_N_BS;
         if (line->out_waits > MOST_WAITS) {
-            line->out_due = 0; /* given up at the next look */
+            line->out_due = 0; /* abandoned at the next poll */
         }
         break;
     case 2: line->out_due = 0; break; /* overflow */
@@ -128,7 +126,8 @@ void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64
 
 bool teds_isotp_single(const uint8_t *data, size_t length, const uint8_t **body, size_t *octets)
 {
-    const size_t start = length > 8 ? 2 : 1; /* the length has its escape in frames of more than 8 octets, and only there */
+    /* frames of more than 8 octets have the length in an extra octet, and only these */
+    const size_t start = length > 8 ? 2 : 1;
     if (length < 2 || data[0] >> 4 != 0 || (start == 2 && data[0] != 0)) {
         return false;
     }

@@ -5,25 +5,25 @@
 
 #include "inside.h"
 
-#define TEDS_N_BS TEDS_SECOND /* a flow control is waited for so long */
+#define TEDS_N_BS TEDS_SECOND /* longest wait for flow control */
 enum { TEDS_OUT_IDLE, TEDS_OUT_FIRST, TEDS_OUT_WAITS, TEDS_OUT_RUNS };
 
-/* Begin to send a message; its octets stay where they are until it has left. */
+/* Begin to send a message; its octets must not change until it was sent. */
 void teds_isotp_begin(teds_line *line, const uint8_t *octets, size_t length, bool fd);
 
-/* The next frame, if one may leave now. */
+/* The next frame, if one may be sent now. */
 bool teds_isotp_next(teds_line *line, teds_can_frame *frame, uint64_t now);
 
-/* A flow control came. */
+/* Handle flow control from the station. */
 void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64_t now);
 
-/* STmin in ns; reserved values are the longest one. */
+/* STmin in ns; reserved values count as the longest. */
 uint32_t teds_isotp_gap(uint8_t stmin);
 
-/* Read a single frame; false if it is none. */
+/* Read a single frame; false if it is not one. */
 bool teds_isotp_single(const uint8_t *data, size_t length, const uint8_t **body, size_t *octets);
 
-/* Fill a frame up: classic frames have 8 octets, FD ones the next length that FD knows. */
+/* Pad a frame: classic frames to 8 octets, FD ones to the next valid length. */
 void teds_can_pad(teds_can_frame *frame, size_t used);
 
 #endif

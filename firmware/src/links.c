@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Links to stations: what a reply that has left sets going, what ends when a link is lost, and the move to another CAN
- * address, with which every link on the bus ends. */
+/* Links to stations: actions after a reply was sent, the end of a lost link, and the move to another CAN address, which
+ * ends every link on the bus. */
 #include "links.h"
 #include "agree.h"
 #include "manage.h"
@@ -39,7 +39,7 @@ void teds_address_move(teds_node *node, uint8_t address)
 {
     if (address != node->can.address) {
         node->can.address = address;
-        node->can.gives_up = false; /* the address that was claimed is left */
+        node->can.gives_up = false; /* the conflict was about the old address */
         node->can.turned_away = 0;
         teds_can_links_forget(node);
     }

@@ -1,8 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Manage (profile.md, "Firmware"): one SMP packet in, one out. The port's manager sees a packet only if it is one of a short
- * list, with a body that cannot mean two things, at a moment that harms no one: two packets in one, erasing of storage, an
- * image that is permanent before it ran and recovery modes never pass. Whether an image may run is the boot loader's
- * decision. */
+/* Manage (profile.md, "Firmware"): one SMP packet in, one out. The port's manager gets a packet only if it is on a
+ * short list, has an unambiguous body and comes at a safe time. Two packets in one, erasing storage, making an image
+ * permanent before it ran, and recovery modes are always refused. The boot loader decides if an image may run. */
 #include "manage.h"
 #include "about.h"
 #include "clock.h"
@@ -12,19 +11,19 @@
 
 #define HEADER_OCTETS 8u
 #define SHORTEST (HEADER_OCTETS + 1u)
-/* A sealed command's headers, counter, tag and longest padding. */
+/* The longest packet: less a sealed command's headers, counter, tag and longest padding. */
 #define LONGEST (TEDS_MAX_MESSAGE - 53u)
-#define UPLOAD_NS (60u * TEDS_SECOND)   /* without a good packet an upload is over */
-#define ANOTHER_NS (10u * TEDS_SECOND)  /* between beginnings of different uploads: each erases flash */
+#define UPLOAD_NS (60u * TEDS_SECOND)   /* an upload ends after so long without a good packet */
+#define ANOTHER_NS (10u * TEDS_SECOND)  /* between starts of different uploads, because each erases flash */
 #define TRIAL_NS (600u * TEDS_SECOND)
 #define SHA_OCTETS 32u
-#define DEPTH 8u /* of maps and arrays in each other */
-#define AN_ANSWER 1u /* in the first octet */
+#define DEPTH 8u /* nesting limit of maps and arrays */
+#define AN_ANSWER 1u /* bit in the first octet of an answer */
 
-/* -- CBOR (RFC 8949), as far as a filter needs it ------------------------------------------------------------------ */
+/* -- a CBOR reader (RFC 8949) for this filter ---------------------------------------------------------------------- */
 
 enum { UNSIGNED = 0, OCTETS = 2, TEXT = 3, ARRAY = 4, MAP = 5, TAG = 6, SIMPLE = 7 };
-#define OPEN_END 31u /* of an array or map without a length; as a simple value it closes one */
+#define OPEN_END 31u /* of an array or map of indefinite length; as a simple value, its end */
 
 typedef struct reading {
     const uint8_t *at, *end;
@@ -37,8 +36,8 @@ typedef struct item {
     const uint8_t *octets; /* of a string: where they begin */
 } item;
 
-/* Read an item's head, and a string's octets; false if it is cut or of a kind that never passes (tags, floating numbers,
- * strings in pieces). */
+/* Read an item's head, and a string's octets; false if it is cut off or of a kind that is never accepted (tags,
+ * floating numbers, strings in pieces). */
 static bool read_item(reading *in, item *out)
 {
     uint8_t additional;
@@ -104,7 +103,7 @@ static unsigned find_key(const item *key)
     return IGNORED_MEMBER;
 }
 
-/* Note a value; false if it has another type, or is there twice: the manager could take the other one. */
+/* Store a value; false for another type or a duplicate, of which the manager could use the other one. */
 static bool note_value(packet_map *out, unsigned key, const item *value)
 {
     bool good = true;
@@ -134,12 +133,12 @@ static bool note_value(packet_map *out, unsigned key, const item *value)
 
 /* A map or array that is being read. */
 typedef struct level {
-    bool map, open, odd; /* odd: a key came, its value comes next */
+    bool map, open, odd; /* odd: a key was read, its value is next */
     uint32_t left;
 } level;
 
-/* True if the octets are one map and nothing else. `plain`: of a known length, with text as keys and without maps or arrays in
- * it. `out` receives the members of the map itself; NULL: they are skipped. */
+/* True if the octets are one map and nothing else. `plain`: of definite length, with text keys and without nested maps
+ * or arrays. `out` receives the members of the outer map; NULL: they are skipped. */
 static bool read_map(const uint8_t *octets, size_t length, bool plain, packet_map *out)
 {
     reading in = {octets, octets + length};
@@ -191,7 +190,7 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, packet_ma
     return in.at == in.end;
 }
 
-/* -- the list ------------------------------------------------------------------------------------------------------ */
+/* -- the list of permitted requests -------------------------------------------------------------------------------- */
 
 typedef enum request { READS, ECHO, RESTART, CONFIRM, TRY, UPLOAD, NOT_LISTED, BAD_BODY } request;
 
@@ -203,7 +202,8 @@ static bool is_body(const uint8_t *body, size_t length, const uint8_t *is, size_
     return length == octets && memcmp(body, is, octets) == 0;
 }
 
-/* Of 1/0: the three bodies that there are, octet for octet. None makes an image permanent that has not run. */
+/* Requests of 1/0: the three permitted bodies, compared octet by octet. None makes an image permanent that has not run.
+ * */
 static request classify_state(const uint8_t *body, size_t length)
 {
     static const uint8_t confirm[] = {0xA1, 0x67, 'c', 'o', 'n', 'f', 'i', 'r', 'm', 0xF5};
@@ -239,7 +239,7 @@ static request classify_packet(const uint8_t *packet)
     return NOT_LISTED;
 }
 
-/* Which request a packet is. `out`: the members of an upload. */
+/* Classify a packet. `out`: the members of an upload. */
 static request classify_request(const uint8_t *packet, size_t length, packet_map *out)
 {
     const uint8_t *body = packet + HEADER_OCTETS;
@@ -255,7 +255,7 @@ static request classify_request(const uint8_t *packet, size_t length, packet_map
     }
 }
 
-/* -- when ---------------------------------------------------------------------------------------------------------- */
+/* -- when a request is permitted ----------------------------------------------------------------------------------- */
 
 static bool is_upload_alive(teds_node *node)
 {
@@ -279,7 +279,7 @@ static bool has_any_claim(const teds_node *node)
     return false;
 }
 
-/* Another image is to be uploaded right after the last one began. */
+/* True if an upload of another image begins too soon after the last one. */
 static bool is_too_soon(const teds_node *node, const packet_map *upload)
 {
     const teds_managed *own = &node->managed;
@@ -300,12 +300,12 @@ static int check_moment(teds_node *node, request asked, const packet_map *upload
         return -TEDS_BUSY;
     }
     if (asked != RESTART && (node->firmware & (TEDS_FIRMWARE_ON_TRIAL | TEDS_FIRMWARE_PENDING)) != 0) {
-        return -TEDS_BUSY; /* the second slot holds the way back */
+        return -TEDS_BUSY; /* the second slot has the image to revert to */
     }
     return asked == UPLOAD && is_too_soon(node, upload) ? -TEDS_BUSY : 0;
 }
 
-/* What the running trial keeps as it is, and what an upload does not bear beside it. */
+/* Refuse commands that would change stored state during a trial, or that must not run during an upload. */
 int teds_demand_no_image(teds_node *node, const teds_command *command)
 {
     const uint8_t function = command->function;
@@ -324,7 +324,7 @@ int teds_demand_no_image(teds_node *node, const teds_command *command)
     return 0;
 }
 
-/* -- the packet ---------------------------------------------------------------------------------------------------- */
+/* -- running a packet ---------------------------------------------------------------------------------------------- */
 
 static int plan_restart(teds_node *node, const uint8_t *packet, teds_link link, uint8_t *out)
 {
@@ -356,7 +356,7 @@ static void continue_upload(teds_node *node, teds_session *session, const packet
     own->upload_until = teds_now(node) + UPLOAD_NS;
 }
 
-/* The images have changed; what a trial left to be erased goes when it is confirmed. */
+/* Read the state of the images again. Once a trial is confirmed, the slot whose erasure it delayed may be erased. */
 static void note_images(teds_node *node)
 {
     const bool was = teds_on_trial(node);
@@ -408,7 +408,7 @@ int teds_manage(teds_node *node, const teds_command *command, teds_origin *origi
     if (asked == UPLOAD && upload.off == 0) {
         begin_upload(&node->managed, &upload, teds_now(node));
     }
-    memcpy(head, packet, sizeof head); /* the answer takes its place */
+    memcpy(head, packet, sizeof head); /* the answer overwrites it */
     length = port->manage(port->user, packet, length, out, most);
     if (asked == CONFIRM || asked == TRY) {
         note_images(node);
@@ -423,7 +423,7 @@ int teds_manage(teds_node *node, const teds_command *command, teds_origin *origi
     return (int)length;
 }
 
-/* -- beside commands ----------------------------------------------------------------------------------------------- */
+/* -- effects on other commands ------------------------------------------------------------------------------------- */
 
 void teds_upload_end(teds_node *node, const teds_session *session)
 {

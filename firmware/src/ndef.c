@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* NDEF messages, their framing alone (NFC Forum NDEF 1.0, 3.2): what a reader wrote, and the records that a node gives. */
+/* NDEF framing (NFC Forum NDEF 1.0, 3.2): reading messages of a reader, and writing records. */
 #include "ndef.h"
 #include "inside.h"
 
@@ -61,7 +61,8 @@ static bool is_type(const record *each, uint8_t tnf, const char *name, size_t le
     return true;
 }
 
-/* A whole record, chunks put together: what of it the profile looks at. False: a selection that does not add up. */
+/* Note the parts of a whole record, with its chunks joined, that the profile uses. False: an inconsistent service
+ * selection. */
 static bool note_record(const record *each, teds_ndef *out)
 {
     if (!out->any) {
@@ -82,7 +83,7 @@ static bool note_record(const record *each, teds_ndef *out)
     return true;
 }
 
-/* Chunks are put together in place, so `message` is written. */
+/* Chunks are joined in place, so `message` is modified. */
 bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out)
 {
     record whole = {0}, each = {0};

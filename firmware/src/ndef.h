@@ -9,18 +9,19 @@
 #define TEDS_TIM_TYPE "teds-provision:tim"
 enum { TEDS_NDEF_WELL_KNOWN = 1, TEDS_NDEF_MIME = 2, TEDS_NDEF_EXTERNAL = 4, TEDS_NDEF_BEGINS = 0x80, TEDS_NDEF_ENDS = 0x40 };
 
-/* What of a message the profile looks at; NULL: no such record. */
+/* The parts of a message that the profile uses; NULL: no such record. */
 typedef struct teds_ndef {
-    bool any, charges; /* the first record is about how the reader charges */
-    bool chunked;      /* a record came in chunks, which are put together: behind them the message is no message any more */
+    bool any, charges; /* charges: the first record is about how the reader charges */
+    /* a record came in chunks, which are joined in place, so the octets after it are no valid message any more */
+    bool chunked;
     const uint8_t *selection, *payload;
     size_t selection_length, payload_length;
 } teds_ndef;
 
-/* Read a message; false if its records do not fit it. Records in chunks are put together in place. */
+/* Read a message; false if it is not well formed. Records in chunks are joined in place. */
 bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out);
 
-/* Write a record up to its payload; return how many octets that is. */
+/* Write a record up to its payload; return the number of octets written. */
 size_t teds_ndef_head(uint8_t *at, uint8_t marks, uint8_t tnf, const char *type, size_t type_length, size_t payload);
 #endif
 

@@ -1,6 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The life of a node: its start, its time, reset by hand. What it answers is the matter of commands.c, how it is asked
- * that of can.c, tnep.c and ble.c. */
+/* Start, time, and reset by hand of a node. commands.c answers commands; can.c, tnep.c and ble.c receive them. */
 #include "about.h"
 #include "can.h"
 #include "clock.h"
@@ -21,7 +20,7 @@ int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *
     teds_firmware firmware;
     int failed;
     if (built != teds_built()) {
-        return TEDS_E_BUILD; /* this node may be larger than the board's */
+        return TEDS_E_BUILD; /* the library's teds_node may be larger than the board's */
     }
     memset(node, 0, sizeof *node);
     node->config = config;
@@ -41,12 +40,12 @@ int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *
         return TEDS_E_USAGE;
     }
 #endif
-    (void)teds_firmware_read(node, &firmware); /* first: while an image is on trial no flash is changed */
+    (void)teds_firmware_read(node, &firmware); /* read first: during a trial no flash is changed */
     failed = teds_slots_load(node);
     if (failed) {
         return failed;
     }
-    /* c of Open is random at each start, so that no mac from before it is good again */
+    /* c of Open is random at each start, so that no earlier mac is accepted. */
     if (port->random(port->user, counter, sizeof counter) != 0) {
         return TEDS_E_RANDOM;
     }
@@ -71,7 +70,7 @@ int teds_node_reset_by_hand(teds_node *node)
         node->port->restart(node->port->user);
         return 0;
     }
-    failed = teds_in_factory(node) ? 0 : teds_to_factory(node); /* no write if nothing changes */
+    failed = teds_in_factory(node) ? 0 : teds_to_factory(node); /* nothing is written if nothing changes */
     if (failed) {
         return TEDS_E_FLASH;
     }
@@ -102,7 +101,7 @@ uint64_t teds_node_poll(teds_node *node, uint64_t now)
     if (node->old_slot_due) {
         teds_sooner(&next, node->old_slot_by);
     }
-    teds_sooner(&next, teds_sessions_poll(node, now)); /* last: what ran above may have opened one */
+    teds_sooner(&next, teds_sessions_poll(node, now)); /* last, since the calls above may have opened a session */
     return next;
 }
 

@@ -96,12 +96,12 @@ void teds_yield_sensors(teds_node *node, teds_session *session)
 {
     for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
         if (each != session) {
-            teds_claims_end(node, each, UINT32_MAX, false); /* no actuator is claimed: that was demanded before */
+            teds_claims_end(node, each, UINT32_MAX, false); /* no actuator is claimed: the caller has checked that */
         }
     }
 }
 
-/* 1.3, 1.4, 128.10: 2 in a session that claims, 17 if another does. */
+/* Rule for 1.3, 1.4 and 128.10: refuse with 2 if this session has a claim, with 17 if another one has. */
 int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes)
 {
     (void)teds_operation_poll(node, teds_now(node));
@@ -258,7 +258,7 @@ int teds_operation_state(teds_node *node, const teds_command *command, teds_orig
     return length;
 }
 
-/* -- one value at a time ------------------------------------------------------------------------------------------- */
+/* -- single values ------------------------------------------------------------------------------------------------- */
 
 bool teds_is_claimed(const teds_origin *origin, int place)
 {
@@ -290,7 +290,7 @@ int teds_read_data_set(teds_node *node, const teds_command *command, teds_origin
 
 int teds_sample(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    uint8_t channels[MOST_SAMPLE]; /* a copy: the reply grows over the command */
+    uint8_t channels[MOST_SAMPLE]; /* a copy, because the reply overwrites the command */
     const size_t count = command->length;
     size_t length = 9;
     uint64_t tick;
@@ -326,7 +326,7 @@ int teds_sample(teds_node *node, const teds_command *command, teds_origin *origi
     return (int)length;
 }
 
-/* Give actuators their values: `pairs` of channel and data set, checked to be claimed here. */
+/* Set actuators: `pairs` of channel and data set, checked to be claimed by this session. */
 int teds_set_actuators(teds_node *node, const uint8_t *pairs, size_t length)
 {
     const teds_port *port = node->port;
@@ -348,7 +348,7 @@ int teds_set_actuators(teds_node *node, const uint8_t *pairs, size_t length)
             port->kick(port->user, pairs[at]);
         }
         node->deadline[place] = now + node->dead_man[place] * MILLI;
-        node->safe &= ~(UINT32_C(1) << place); /* NOLINT: the caller has looked each channel up, so none is -1 */
+        node->safe &= ~(UINT32_C(1) << place); /* NOLINT: the caller has checked each channel, so none is -1 */
     }
     return 0;
 }
@@ -393,7 +393,7 @@ int teds_set(teds_node *node, const teds_command *command, teds_origin *origin, 
         if (pairs[at] == 0) {
             return -TEDS_BAD_FORM;
         }
-        if (place < 0) { /* it has no width, so nothing after it can be read */
+        if (place < 0) { /* its width is unknown, so nothing after it can be read */
             return -TEDS_WRONG_STATE;
         }
         if ((seen >> place & 1) != 0 || at + 1 + teds_channel_at(node, place)->octets > command->length) {

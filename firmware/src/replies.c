@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Stored replies (wire.md, "Repetition"): one for each link, so that a command that is repeated because its reply was lost
- * gets that reply and is not run twice. */
+/* Stored replies (wire.md, "Repetition"), one per link: a command that is repeated because its reply was lost gets that
+ * reply, and is not run twice. */
 #include "replies.h"
 #include "clock.h"
 #include "commands.h"
@@ -11,10 +11,10 @@
 
 #define KEEP_NS (20u * TEDS_SECOND)
 
-/* -- what is being sent -------------------------------------------------------------------------------------------- */
+/* -- replies being sent -------------------------------------------------------------------------------------------- */
 
 #if TEDS_BLE
-/* The place of a stored reply is read in pieces, and may not be taken by another link meanwhile. */
+/* A stored reply is sent in pieces, so its place must not be given to another link meanwhile. */
 static bool is_sent_by_ble(const teds_node *node, const teds_stored_reply *reply)
 {
     for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
@@ -45,7 +45,7 @@ static bool is_being_sent(const teds_node *node, const teds_stored_reply *reply)
 #endif
 }
 
-/* An answer to everyone counts for nothing here: any stranger can keep one waiting. */
+/* Broadcast answers do not count: any stranger could keep one waiting. */
 bool teds_replies_wait(const teds_node *node, uint64_t now)
 {
     bool waits = false;
@@ -67,8 +67,8 @@ bool teds_replies_wait(const teds_node *node, uint64_t now)
 
 /* -- places -------------------------------------------------------------------------------------------------------- */
 
-/* A link's place: its own, a free one, the oldest of those whose link has no session; of these rather one that is not
- * being sent. NULL: every place is that of a session, in a build that has no place more than sessions. */
+/* Find the place for a link's reply: its own, a free one, or the oldest of a link without a session, preferably one
+ * that is not being sent. NULL: all places belong to sessions, in a build with no more places than sessions. */
 static teds_stored_reply *find_place(teds_node *node, teds_link link)
 {
     enum { FREE, TAKEN, SENT, NONE } best = NONE;
@@ -94,7 +94,7 @@ static teds_stored_reply *find_place(teds_node *node, teds_link link)
     for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
         if (line->out_reply == found) {
             line->out_state = TEDS_OUT_IDLE;
-            line->out_reply = NULL; /* it is another link's from now on */
+            line->out_reply = NULL; /* the place belongs to another link from now on */
         }
     }
 #if TEDS_NFC
@@ -111,8 +111,8 @@ static teds_stored_reply *find_place(teds_node *node, teds_link link)
     return found;
 }
 
-/* Identify, Prove, About, List, Query and Read outside Sealed are always run again. */
-static bool runs_anew(const uint8_t *frame, size_t length)
+/* Identify, Prove, About, List, Query and Read outside Sealed are run each time. */
+static bool always_runs(const uint8_t *frame, size_t length)
 {
     if (length < 4) {
         return false;
@@ -135,11 +135,11 @@ teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arriv
     }
     teds_sha256_parts(node, parts, 2, digest);
     if (!place->stored || memcmp(digest, place->digest, 32) != 0 || teds_now(node) >= place->at + KEEP_NS ||
-        runs_anew(frame, length)) {
+        always_runs(frame, length)) {
         place->stored = false;
         place->length = (uint16_t)(1 + teds_node_handle(node, link, arrival, frame, length, place->octets + 1));
         memcpy(place->digest, digest, 32);
-        place->used = true; /* its link may have ended by its own command */
+        place->used = true; /* the command may have ended its own link */
         place->stored = length <= TEDS_MAX_MESSAGE;
         place->link = link;
         place->at = teds_now(node);

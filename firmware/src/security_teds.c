@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The Security TEDS (security-teds.md, 1): the initial one, and the canonical form of a signed one. Octets alone. */
+/* The Security TEDS (security-teds.md, 1) as octets: the initial one, and the canonical form of a signed one. */
 #include "security_teds.h"
 #include "inside.h"
 
@@ -68,7 +68,7 @@ static bool decode_base64(const uint8_t *text, size_t length, uint8_t *out)
     return out[65] == 0 && (length == 65 || out[64] == 0);
 }
 
-/* The initial one is a head, fields 101 and 102 in base64 with a head of two octets each, and a tail. */
+/* The initial one consists of a head, fields 101 and 102 in base64 with a head of two octets each, and a tail. */
 #define TEXT_OCTETS 88u
 #define TAIL_AT (TEDS_INITIAL_OCTETS - 2 - sizeof TAIL)
 static const uint8_t HEAD[] = {0, 0, 0, TEDS_INITIAL_OCTETS - 4, 3, 4, 0, 128, 1, 1, 1, 1, 4, 2, 1, 2, 3, 1, 0,
@@ -118,8 +118,8 @@ static bool is_utf8(const uint8_t *text, size_t length)
     return true;
 }
 
-/* Fields that a signed one holds, each once and ascending: type, length, the value of one octet that the profile wants.
- * 108 comes between 107 and 109, once for each block. */
+/* Fields of a signed one, each once and ascending: type, length, and the value that the profile requires for fields of
+ * one octet. 108 comes between 107 and 109, once for each block. */
 static const uint8_t FIELDS[][3] = {
     {1, 1, 4},          {2, 1, 2},          {3, 1, 0},          {4, 1, 1},          {5, 64, 0},         {6, 8, 0},
     {100, TEXT_OCTETS}, {101, TEXT_OCTETS}, {102, TEXT_OCTETS}, {103, TEXT_OCTETS}, {104, TEXT_OCTETS}, {105, 1, 1},
@@ -127,8 +127,8 @@ static const uint8_t FIELDS[][3] = {
 };
 #define FIELD_COUNT (sizeof FIELDS / sizeof FIELDS[0])
 
-/* 88 letters: a signature (100, 102, 104) or a point (101, 103). What is only compared stands where 103 comes afterwards,
- * so that no more of them lie on the stack than are needed. */
+/* 88 letters: a signature (100, 102, 104) or a point (101, 103). Values that are only compared are decoded into the
+ * place of 103, which comes later, to save stack. */
 static bool take_text(const teds_node *node, teds_signed *out, uint8_t type, const uint8_t *text)
 {
     const uint8_t *own = type == 101 ? node->identity.point : node->identity.signature;
@@ -209,7 +209,7 @@ bool teds_security_parse(const teds_node *node, const uint8_t *block, size_t len
     return next == FIELD_COUNT;
 }
 
-/* A listed block: channel 2, access code 1, digest 32, behind the head of its tuple. */
+/* A listed block: channel 2, access code 1, digest 32, after the head of its tuple. */
 const uint8_t *teds_listed_block(const teds_signed *teds, size_t place)
 {
     return teds->blocks + 37 * place + 2;

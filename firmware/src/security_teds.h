@@ -5,7 +5,7 @@
 
 #include "inside.h"
 
-/* The fields of signatures, without their base64. */
+/* The signature fields, decoded from base64. */
 enum { TEDS_SIGNATURE, TEDS_STATION, TEDS_STATION_SIGNATURE }; /* 100, 103, 104 */
 
 /* The fields of a signed one. */
@@ -18,21 +18,21 @@ typedef struct teds_signed {
     size_t signature_at; /* of its tuple, in the data block */
 } teds_signed;
 
-/* Read a data block; false if it is not in the canonical form. No signature is looked at. */
+/* Read a data block; false if it is not in canonical form. Signatures are not verified here. */
 bool teds_security_parse(const teds_node *node, const uint8_t *block, size_t length, teds_signed *out);
 
-/* A block that it lists, by its place: channel 2, access code 1, digest 32. */
+/* Return a listed block by its index: channel 2, access code 1, digest 32. */
 const uint8_t *teds_listed_block(const teds_signed *teds, size_t place);
 
 bool teds_is_listed(const teds_signed *teds, uint16_t id);
 
-/* The Security TEDS of a node that no station has signed for. */
+/* Write the Security TEDS of a node for which no station has signed. */
 void teds_put_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS]);
 
 /* Checksum of a TEDS whose `length` octets precede it. */
 uint16_t teds_checksum(const uint8_t *octets, size_t length);
 
-/* True if an image is a TEDS by itself: length, checksum, the access code in its header. */
+/* True if an image is valid by itself: length, checksum, and the access code in its header. */
 bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length);
 
 #endif

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Sessions (security-teds.md, 4): the table of them, Open, the keys that it makes, and sealing with them. Sessions and
- * half-open Opens are tables apart, so that no plain question, and no Open of a stranger, ends a session. When sessions
- * begin and end is the matter of session_life.c. */
+/* Sessions (security-teds.md, 4): their table, Open and its keys, and sealing. Sessions and half-open Opens have
+ * separate tables, so that neither a plain command nor a stranger's Open ends a session. session_life.c decides when
+ * sessions begin and end. */
 #include "session.h"
 #include "clock.h"
 #include "crypto.h"
@@ -52,7 +52,7 @@ int teds_run_key(const teds_node *node, const teds_session *session, const char 
 static void keep_half_open(teds_node *node, teds_link link, const teds_keys *keys)
 {
     teds_half_open *place = teds_half_open_on(node, link);
-    if (place == NULL) { /* a free one, whose time is 0; beyond its room the oldest goes */
+    if (place == NULL) { /* a free place has time 0; if there is none, the oldest is dropped */
         place = &node->half_open[0];
         for (size_t i = 1; i < TEDS_SESSIONS; i++) {
             if (node->half_open[i].until < place->until) {
@@ -89,7 +89,7 @@ static int derive_keys(const teds_node *node, const uint8_t es[65], const uint8_
     return failed;
 }
 
-/* keyId and mac before the point: a stranger costs no point arithmetic, and each Open is good once. */
+/* Check keyId and mac before the point: strangers cause no point arithmetic, and each Open works only once. */
 static int check_open(teds_node *node, const uint8_t *payload)
 {
     const uint8_t *es = payload + 8;
@@ -142,7 +142,7 @@ int teds_open(teds_node *node, const teds_command *command, teds_origin *origin,
 
 /* -- Sealed -------------------------------------------------------------------------------------------------------- */
 
-/* Octets of the inner frame behind the padding of RFC 5652 6.3; -1 if the padding is wrong. */
+/* Octets of the inner frame, without the padding of RFC 5652 6.3; -1 if the padding is wrong. */
 static int strip_padding(const uint8_t *plain, size_t length)
 {
     uint8_t count = length > 0 ? plain[length - 1] : 0;

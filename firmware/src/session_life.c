@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* When a session begins and when it ends, and what ends with it: claims and streams, staging, an upload, a Request that
- * waits for its Confirm. */
+/* Begin and end of sessions, and what ends with them: claims and streams, staging, an upload, a Request that waits for
+ * its Confirm. */
 #include "session_life.h"
 #include "agree.h"
 #include "clock.h"
@@ -41,7 +41,7 @@ void teds_sessions_end(teds_node *node)
     teds_pending_forget(node);
 }
 
-/* True if that time has come; if not, something is due then. */
+/* True if the time has come; otherwise lower `due` to it. */
 static bool is_over(uint64_t at, uint64_t now, uint64_t *due)
 {
     if (now >= at) {
@@ -59,7 +59,8 @@ uint64_t teds_sessions_poll(teds_node *node, uint64_t now)
         teds_half_open *half = &node->half_open[i];
         if (session->used && is_over(session->good_at + IDLE_NS, now, &due)) {
 #if TEDS_OPERATION
-            (void)teds_operation_poll(node, now); /* a dead-man that stopped an actuator before is reported, this end is not */
+            /* first, so that a dead-man that already stopped an actuator is reported; the end of a session is not */
+            (void)teds_operation_poll(node, now);
 #endif
             teds_session_end(node, session);
         }
@@ -73,8 +74,8 @@ uint64_t teds_sessions_poll(teds_node *node, uint64_t now)
     return due;
 }
 
-/* A place for the session that a half-open Open becomes: its link's own, a free one, that of the session without a
- * claim that was silent longest; NULL if all have claims. */
+/* The place of a new session: its link's own, a free one, or that of the session without claims that was silent
+ * longest; NULL if all have claims. */
 static teds_session *make_session_room(teds_node *node, teds_link link)
 {
     teds_session *place = teds_session_on(node, link);
@@ -97,7 +98,7 @@ static teds_session *make_session_room(teds_node *node, teds_link link)
     return place;
 }
 
-/* The session that a half-open Open becomes with its first good message; NULL if there is no room. */
+/* Begin the session of a half-open Open at its first good message; NULL if there is no room. */
 static teds_session *begin_session(teds_node *node, teds_link link, uint8_t kind, teds_half_open *half)
 {
     teds_session *session = make_session_room(node, link);

@@ -1,10 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The two slots of flash that take turns to hold a node's state and its TEDS.
- *
- * The rule: erase the free slot, write head, records and CRC in ascending units, read it back; only then it counts and
- * RAM follows. The old slot is erased when the reply has left. At a start the good slot with the higher counter counts,
- * and the other one is erased if it is not blank: whatever was cut, there is the old state or the new one, whole.
- */
+/* Two slots of flash take turns to hold a node's state and its TEDS. To write: erase the free slot; write head, records
+ * and CRC in ascending units; read it back; only then it counts, and RAM is updated. The old slot is erased after the
+ * reply was sent. At a start, the good slot with the higher counter counts, and the other one is erased unless blank:
+ * after any interruption, either the old or the new state is complete. */
 #include "slots.h"
 #include "area.h"
 #include "clock.h"
@@ -14,18 +12,20 @@
 #include "teds_source.h"
 #include "inside.h"
 
-/* head of a slot: magic 4, version 1, flags 1, address 1, 0, counter 4, octets of all but the CRC 4, octets of records 4,
- * epoch 4, sequence 4, key 16, station 65, CA 65, zeros; then records: id 2, 0 0, length 4, TEDS; CRC-32 ends the slot */
+/* Head of a slot: magic 4, version 1, flags 1, address 1, 0, counter 4, octets of all but the CRC 4, octets of records
+ * 4, epoch 4, sequence 4, key 16, station 65, CA 65, zeros. Then records: id 2, 0 0, length 4, TEDS. The slot ends with
+ * a CRC-32. */
 #define HEAD_OCTETS 192u
 #define NUMBERS_OCTETS 28u /* of the head, up to the key */
 #define RECORD_OCTETS 8u
 #define PIECE 64u
-#define OLD_SLOT_NS (15u * TEDS_SECOND) /* no station repeats a command after that */
+#define OLD_SLOT_NS (15u * TEDS_SECOND) /* stations repeat no command after that */
 static const uint8_t SLOT_MAGIC[5] = {'T', 'S', 'L', 'T', 1};
 
 /* -- records ------------------------------------------------------------------------------------------------------- */
 
-/* The record at `at`, or false at the end. Moves `at` behind it; if flash cannot be read it stays before the end. */
+/* Read the record at `at`, or return false at the end. Moves `at` to the next record; if flash cannot be read, `at`
+ * remains before the end. */
 static bool next_record(const teds_node *node, uint32_t *at, uint16_t *id, teds_source *source)
 {
     uint8_t head[RECORD_OCTETS];
@@ -47,7 +47,7 @@ bool teds_find_stored(const teds_node *node, uint16_t id, teds_source *out)
             return true;
         }
     }
-    /* flash does not show whether it is there: reading it fails, so that the answer is no 18 */
+    /* If flash cannot be read, the TEDS may exist: reading it fails, so that the reply is not 18. */
     *out = (teds_source){.unreadable = at != node->records_end, .length = 12};
     return out->unreadable;
 }
@@ -65,8 +65,8 @@ bool teds_next_stored(const teds_node *node, int32_t after, int32_t *found)
 
 /* -- at a start ---------------------------------------------------------------------------------------------------- */
 
-/* Read the numbers of a slot's head; `good` if the slot is. One that is whole in a form of other firmware is never taken
- * for torn: the start fails, and an image on trial reverts. */
+/* Read the numbers of a slot's head; `good` if the slot is. A complete slot of other firmware's form is never treated
+ * as torn: the start fails, and an image on trial reverts. */
 static int read_head(const teds_port *port, int area, uint8_t head[NUMBERS_OCTETS], bool *good)
 {
     uint32_t total;
@@ -128,7 +128,7 @@ int teds_slots_load(teds_node *node)
             continue;
         }
         if (teds_on_trial(node)) {
-            node->free_slot_dirty = true; /* erased when the image is confirmed */
+            node->free_slot_dirty = true; /* it is erased when the image is confirmed */
             continue;
         }
         if (teds_area_scan(port, TEDS_SLOT_A + i, port->slot_octets, &blank, &crc) != 0 ||
@@ -136,13 +136,14 @@ int teds_slots_load(teds_node *node)
             if (!good[0] && !good[1]) {
                 return TEDS_E_FLASH;
             }
-            node->free_slot_dirty = node->spare_slot_fails = true; /* the other one is whole: enough to measure */
+            /* the other slot is whole, which is enough to measure */
+            node->free_slot_dirty = node->spare_slot_fails = true;
         }
     }
     if (good[0] || good[1]) {
         return take_slot(node, good[0] ? TEDS_SLOT_A : TEDS_SLOT_B, head[good[0] ? 0 : 1]);
     }
-    node->slot = TEDS_SLOT_B; /* nothing is stored: A is written now, so that it shows that the identity counts */
+    node->slot = TEDS_SLOT_B; /* nothing is stored: write A now, which makes the identity permanent */
     node->state.address = teds_default_address(node);
     if (teds_slots_write(node, &node->state, NULL) != 0) {
         return TEDS_E_FLASH;
@@ -174,14 +175,14 @@ int teds_slots_blank(teds_node *node)
 void teds_slots_poll(teds_node *node, uint64_t now, bool waits)
 {
     if (node->old_slot_due && (!waits || now >= node->old_slot_by)) {
-        node->old_slot_due = false; /* if it fails, the next Write or start erases it */
+        node->old_slot_due = false; /* if it fails, the next Write or start erases the slot */
         (void)teds_slots_blank(node);
     }
 }
 
 static uint32_t whole_units(const teds_port *port, uint32_t octets)
 {
-    return (octets + port->unit - 1) & ~(uint32_t)(port->unit - 1); /* a power of two */
+    return (octets + port->unit - 1) & ~(uint32_t)(port->unit - 1); /* the unit is a power of two */
 }
 
 static void put_record(const teds_node *node, teds_writing *into, uint16_t id, const teds_source *source)
@@ -197,7 +198,7 @@ static void put_record(const teds_node *node, teds_writing *into, uint16_t id, c
     }
 }
 
-/* The next of the records that may go into the new slot. */
+/* The next record that may be copied to the new slot. */
 static int32_t next_record_id(const teds_node *node, int32_t after, const teds_signed *commit)
 {
     int32_t found = TEDS_NO_ID;
@@ -210,7 +211,8 @@ static int32_t next_record_id(const teds_node *node, int32_t after, const teds_s
     return found;
 }
 
-/* The records of the new slot, ascending: written to `into`, or (NULL) only counted. -1: the old slot cannot be read. */
+/* Write the records of the new slot in ascending order to `into`, or (NULL) only count their octets. -1: the old slot
+ * cannot be read. */
 static int32_t put_records(const teds_node *node, teds_writing *into, const teds_state *state, const teds_signed *commit)
 {
     int32_t id = -1, octets = 0;
@@ -259,7 +261,7 @@ int teds_slots_write(teds_node *node, const teds_state *state, const teds_signed
     teds_put32(head + 16, (uint32_t)octets);
     teds_put32(head + 20, state->epoch);
     teds_put32(head + 24, state->sequence);
-    node->free_slot_dirty = true; /* from here on; afterwards it is the old one */
+    node->free_slot_dirty = true; /* until the write succeeds; then the old slot is the dirty one */
     teds_area_put(&into, head, sizeof head);
     teds_area_put(&into, &state->agreed, sizeof state->agreed);
     teds_area_pad(&into, HEAD_OCTETS);
@@ -267,7 +269,7 @@ int teds_slots_write(teds_node *node, const teds_state *state, const teds_signed
            teds_area_crc_good(port, into.area, total, &good) == 0 && good;
     teds_wipe(into.buffer, sizeof into.buffer);
     if (!good) {
-        /* A slot that is whole and cannot be read back now would count at the next start: it has to go. */
+        /* A slot that cannot be read back now might count at the next start, so erase it. */
         (void)teds_slots_blank(node);
         return -TEDS_FAILURE;
     }

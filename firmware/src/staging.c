@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Staging: one arena in RAM for the images that are written before a commit. Entries of id 2, length 2, image lie one
- * after another. */
+/* Staging: a memory area in RAM for images that are written before a commit, as consecutive entries of id 2, length 2,
+ * image. */
 #include "staging.h"
 #include "inside.h"
 
@@ -22,7 +22,7 @@ void teds_staging_drop(teds_node *node)
     node->staging_of = NULL;
 }
 
-/* Put `length` octets at `offset` of an image; what lay behind them is dropped. */
+/* Put `length` octets at `offset` of an image; octets after them are dropped. */
 int teds_stage(teds_node *node, uint16_t id, uint32_t offset, const uint8_t *octets, size_t length)
 {
     size_t before = 0;

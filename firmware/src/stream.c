@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Streams (operation.md, 3, 4): Subscribe, Stop, samples when they are due, data messages sealed and cut into frames. A
- * stream has one message being filled and one that waits; a waiting one is dropped when the next is
- * full: newest wins. One message at a time is being sent. */
+/* Streams (operation.md, 3, 4): Subscribe, Stop, taking samples when due, data messages sealed and cut into frames. A
+ * stream has one message being filled and one waiting; when the next one is full, the waiting one is dropped: newest
+ * wins. One message is sent at a time. */
 #include "stream.h"
 #include "clock.h"
 #include "isotp.h"
@@ -36,7 +36,7 @@ static uint64_t message_span(const teds_stream *stream)
     return stream->n * stream->period;
 }
 
-/* A message is one notification on BLE. */
+/* Over BLE a message is one notification. */
 static uint64_t count_frames(uint32_t length, bool fd, bool ble)
 {
     uint32_t room = fd ? 64 : 8;
@@ -62,7 +62,7 @@ static void end_stream(teds_node *node, teds_stream *stream)
 {
     node->missed += stream->missed;
     if (node->can.data_stream == stream) {
-        node->can.data_stream = NULL; /* what was not sent yet is taken back */
+        node->can.data_stream = NULL; /* its unsent frames are withdrawn */
     }
     teds_wipe(stream, sizeof *stream);
 }
@@ -173,7 +173,7 @@ static bool is_on_bus(const teds_stream *stream, bool ble)
     return stream->used && stream->ble == ble;
 }
 
-/* The node's budget on the bus, with one more stream in place of `old`. */
+/* Check the node's budget on the bus, with one more stream in place of `old`. */
 static int check_budget(const teds_node *node, const asked *in, uint64_t count, bool ble, const teds_stream *old)
 {
     uint64_t gap = in->gap > 0 ? in->gap : 1, sum = 0;
@@ -215,7 +215,7 @@ static teds_stream *find_stream_room(teds_node *node, teds_stream *old)
     return NULL;
 }
 
-/* Octets of the longest message that this link takes; 0: its station has not enabled them. */
+/* Octets of the longest message on this link; 0: its station has not enabled data notifications. */
 static uint32_t longest_message(const teds_node *node, const teds_origin *origin)
 {
 #if TEDS_BLE
@@ -383,7 +383,7 @@ static uint64_t next_instant(const teds_stream *stream)
     return stream->start + ((uint64_t)stream->counter * stream->n + stream->held) * stream->period;
 }
 
-/* True if the next data message of a bus may begin. */
+/* True if the next data message may be started on a bus. */
 static bool is_bus_free(const teds_node *node, bool ble, uint64_t now)
 {
 #if TEDS_BLE
@@ -399,7 +399,8 @@ static bool is_bus_free(const teds_node *node, bool ble, uint64_t now)
 static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
 {
     uint64_t due = next_instant(stream);
-    stream->late = stream->late || (due <= now && now - due >= message_span(stream)); /* two may be full at once */
+    /* two messages may be full at once */
+    stream->late = stream->late || (due <= now && now - due >= message_span(stream));
     while ((due = next_instant(stream)) <= now) {
         if (stream->kind == EVENT) {
             teds_put64(stream->filling, due);
@@ -411,10 +412,11 @@ static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
         }
         if (stream->full && stream->ready && stream->held + 1u == stream->n &&
             (is_bus_free(node, stream->ble, now) || stream->late)) {
-            return; /* a late loop, not a slow bus: what waits or is half sent leaves first; the loop comes back at once */
+            /* the loop is late, not the bus: first send what waits or is half sent; the loop calls again at once */
+            return;
         }
         if (stream->held == 0 && now - due >= 2 * message_span(stream) + ASLEEP_NS && stream->counter < UINT32_MAX) {
-            /* the board slept for longer than a station waits: those messages are lost, and shown as lost */
+            /* The board slept for longer than a station waits: the missed messages count as lost. */
             uint64_t lost = (now - due) / message_span(stream) - 1;
             lost = lost < UINT32_MAX - stream->counter ? lost : UINT32_MAX - stream->counter;
             stream->counter += (uint32_t)lost;
@@ -426,7 +428,7 @@ static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
     stream->late = false; /* it has caught up */
 }
 
-/* What comes sooner than the period after the last that was sent is dropped, its counter too. */
+/* An event sooner than the period after the last one sent is dropped, with its counter. */
 static void add_event(teds_stream *stream, uint64_t tick, const uint8_t *octets, bool valid)
 {
     if (stream->had_event && tick - stream->last_event < stream->period) {
@@ -472,7 +474,7 @@ void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const ui
     events->in = next_in_ring(at);
 }
 
-/* What the interrupts of one event sensor have left, for one of its streams. */
+/* Take the events that the interrupts of one sensor have queued, for one of its streams. */
 static void take_events(const teds_events *events, teds_stream *stream, uint8_t in, uint16_t lost, uint64_t now)
 {
     uint8_t octets[TEDS_EVENT_OCTETS];
@@ -518,7 +520,7 @@ void teds_streams_sample(teds_node *node, uint64_t now)
         if (each->used) {
             sample_stream(node, each, now);
             if (each->ended && !each->full && node->can.data_stream != each) {
-                end_stream(node, each); /* the last counter was sent */
+                end_stream(node, each); /* the message with the last counter was sent */
             }
         }
     }
@@ -538,7 +540,7 @@ uint64_t teds_streams_due(teds_node *node)
 
 /* -- data messages ------------------------------------------------------------------------------------------------- */
 
-/* Of messages that wait, the one of the smaller n * period goes next; NULL: none. */
+/* Of waiting messages, the one with the smallest n * period is next; NULL: none. */
 static teds_stream *choose_stream(teds_node *node, bool ble)
 {
     teds_stream *chosen = NULL;
@@ -561,7 +563,7 @@ uint64_t teds_data_due(teds_node *node)
     return due;
 }
 
-/* Take the message that waits, sealed. */
+/* Seal the waiting message. */
 static bool seal_message(const teds_node *node, teds_stream *stream, uint8_t *out)
 {
     uint8_t nonce[13] = {0};

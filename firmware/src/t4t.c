@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* A Type 4 tag (NFC Forum T4T 2.0): one NDEF file that any reader reads and writes, its APDUs, and ISO-DEP below them
- * (ISO/IEC 14443-4, 7). For chips whose hardware or library does neither. */
+/* A Type 4 tag (NFC Forum T4T 2.0): one NDEF file that any reader can read and write, its APDUs, and ISO-DEP below them
+ * (ISO/IEC 14443-4, 7). For chips without support for these in hardware or library. */
 #include "tnep.h"
 #include "inside.h"
 
@@ -62,14 +62,14 @@ static size_t read_binary(const teds_node *node, const uint8_t *apdu, size_t len
     return put_status_word(out, octets, OK);
 }
 
-/* A length other than 0 at the begin of the file completes a message. */
+/* Writing a length other than 0 at the beginning of the file completes a message. */
 static size_t update_binary(teds_node *node, size_t offset, const uint8_t *data, size_t length, uint8_t *out)
 {
     size_t size;
     if (offset + length > file_octets(node)) {
         return put_status_word(out, 0, NO_SPACE);
     }
-    node->nfc.stage = TEDS_NFC_QUIET; /* a reader that writes has not waited for an answer */
+    node->nfc.stage = TEDS_NFC_QUIET; /* a reader that writes is not waiting for an answer */
     node->nfc.shows_initial = false;
     memcpy(node->nfc.file + offset, data, length);
     size = teds_get16(node->nfc.file);
@@ -123,7 +123,7 @@ size_t teds_isodep_start(teds_node *node, teds_isodep *card, const uint8_t *rats
     return sizeof ats;
 }
 
-/* The block that was kept: its PCB, then `last_length` octets of the APDU from `last_at` on. */
+/* Send the kept block: its PCB, then `last_length` octets of the APDU from `last_at` on. */
 static size_t put_kept_block(const teds_isodep *card, uint8_t *out)
 {
     out[0] = card->last;
@@ -156,7 +156,7 @@ static size_t take_information(teds_node *node, teds_isodep *card, const uint8_t
         card->length = 0;
     }
     octets = octets < sizeof card->apdu - card->length ? octets : sizeof card->apdu - card->length;
-    memcpy(card->apdu + card->length, block + 1, octets); /* a longer chain is cut, and so refused */
+    memcpy(card->apdu + card->length, block + 1, octets); /* a longer chain is cut, and is then refused */
     card->length = (uint16_t)(card->length + octets);
     card->receives = (block[0] & 0x10u) != 0;
     if (card->receives) {
@@ -176,11 +176,12 @@ size_t teds_isodep_block(teds_node *node, teds_isodep *card, const uint8_t *bloc
     if (length == 0 || length > 256) {
         return 0;
     }
-    pcb = block[0]; /* our ATS offers neither CID nor NAD: a block with one is for another card (ISO/IEC 14443-4, 7.1) */
+    /* blocks with CID or NAD, which our ATS does not offer, are for another card (ISO/IEC 14443-4, 7.1) */
+    pcb = block[0];
     if ((pcb & 0xEEu) == 0x02u) {
         return take_information(node, card, block, length, out);
     }
-    if ((pcb & 0xFEu) == 0xB2u) { /* R(NAK): our last block again, or "I heard nothing" */
+    if ((pcb & 0xFEu) == 0xB2u) { /* R(NAK): the last block again, or none was received */
         if ((pcb & 1u) == card->number && card->last != 0) {
             return put_kept_block(card, out);
         }

@@ -14,7 +14,7 @@
 
 #define STAGED_NS (60u * TEDS_SECOND)
 
-/* True if List could name one more, sealed; `own`: what is staged is this session's. */
+/* True if a sealed List has room for one more TEDS; `own`: staging belongs to this session. */
 static bool can_list(const teds_node *node, uint16_t id, bool own)
 {
     const unsigned among = own ? TEDS_STORED | TEDS_NOT_STORED | TEDS_STAGED : TEDS_STORED | TEDS_NOT_STORED;
@@ -25,7 +25,7 @@ static bool can_list(const teds_node *node, uint16_t id, bool own)
     return 3 * count <= TEDS_ROOM;
 }
 
-/* The TEDS that a command names: its id, or a reason negated. */
+/* Return the id of the TEDS that a command names, or a reason negated. */
 static int find_named(const teds_command *command)
 {
     if (!teds_storable(command->channel, command->payload[0])) {
@@ -34,7 +34,7 @@ static int find_named(const teds_command *command)
     return (int)((uint32_t)command->channel << 8 | command->payload[0]);
 }
 
-/* The reply of Query and Update: attributes of a stored TEDS, or of the staged image in its place. */
+/* The reply of Query and Update: attributes of a stored TEDS, or of the staged image instead. */
 static int put_status_of(const teds_node *node, uint16_t id, bool staged, uint8_t *out)
 {
     static const uint32_t text = 1u << 2 | 1u << 4 | 1u << 6 | 1u << 10 | 1u << 11 | 1u << 14 | 1u << 15;
@@ -115,7 +115,7 @@ int teds_write(teds_node *node, const teds_command *command, teds_origin *origin
         return -TEDS_BUSY;
     }
     if (!can_list(node, (uint16_t)id, !elsewhere) || (elsewhere && 4 + octets > TEDS_STAGING)) {
-        return -TEDS_TOO_LARGE; /* which changes no staging */
+        return -TEDS_TOO_LARGE; /* staging is not changed */
     }
     if (teds_slots_blank(node) != 0) {
         return -TEDS_FAILURE;
@@ -153,7 +153,7 @@ int teds_update(teds_node *node, const teds_command *command, teds_origin *origi
     if (image == NULL && id == (int)TEDS_SECURITY_ID && node->staging_end > 0) {
         return -TEDS_WRONG_STATE;
     }
-    length = put_status_of(node, (uint16_t)id, true, out); /* a commit that succeeds stores what was staged */
+    length = put_status_of(node, (uint16_t)id, true, out); /* a successful commit stores what was staged */
     if (image == NULL) {
         return length;
     }

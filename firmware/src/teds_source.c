@@ -1,6 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Reading one TEDS from flash, from RAM, or made on the fly (the initial Security TEDS); and the tuples
- * in it. */
+/* Reading one TEDS from flash, from RAM, or generated (the initial Security TEDS); and its tuples. */
 #include "teds_source.h"
 #include "area.h"
 #include "security_teds.h"

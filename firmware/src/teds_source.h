@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* One TEDS in flash or RAM, and the tuples in it. A TEDS is named by its id: channel << 8 | access code. */
+/* One TEDS in flash or RAM, and its tuples. The id of a TEDS is channel << 8 | access code. */
 #ifndef TEDS_SRC_TEDS_SOURCE_H
 #define TEDS_SRC_TEDS_SOURCE_H
 
@@ -7,19 +7,19 @@
 
 typedef struct teds_source {
     uint32_t length, at;
-    const uint8_t *octets; /* NULL: in the slot that counts, at `at`; the initial Security TEDS: length alone */
+    const uint8_t *octets; /* NULL: in the current slot, at `at`; the initial Security TEDS: only a length */
     bool initial, read_only, unreadable;
 } teds_source;
 
-/* Read `length` octets from `at` on, which lie within the TEDS. 0, or flash failed. */
+/* Read `length` octets from `at` on, which must be within the TEDS. 0, or flash failed. */
 int teds_source_read(const teds_node *node, const teds_source *source, uint32_t at, uint8_t *out, size_t length);
 
 int teds_source_hash(const teds_node *node, const teds_source *source, uint8_t out[32]);
 
-/* What a search among ids gives at its end, and if flash could not be read. */
+/* Results of a search among ids: the end, and unreadable flash. */
 enum { TEDS_NO_ID = 0x10000, TEDS_UNREADABLE = 0x10001 };
 
-/* `found` becomes `id` if that is above `after` and lower than what was found before: the step of a walk in ascending order. */
+/* Set `found` to `id` if that is above `after` and lower than the best so far: a step of a walk in ascending order. */
 static inline void teds_keep_nearer(uint32_t id, int32_t after, int32_t *found)
 {
     if ((int32_t)id > after && (int32_t)id < *found) {
@@ -37,7 +37,7 @@ typedef struct teds_walk {
 /* The next tuple: its type, and offset and length of its value; false at the end, or if it does not fit. */
 bool teds_next_tuple(teds_walk *in, uint8_t *type, uint32_t *value, uint32_t *length);
 
-/* A number of 1 to 4 octets; UINT32_MAX: it does not fit, or cannot be read. */
+/* A number of 1 to 4 octets; UINT32_MAX: it does not fit, or flash cannot be read. */
 uint32_t teds_number_at(const teds_walk *in, uint32_t at, uint32_t octets);
 
 #endif

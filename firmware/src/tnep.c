@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* NFC (wire.md): the node's half of TNEP 1.0 over an NDEF message, and the pieces of a request and its reply.
- *
- * One buffer is the NDEF file: the reader's message is read from it, the answer is put there. While a command runs it is
+/* NFC (wire.md): the node's side of TNEP 1.0 over an NDEF message, and the pieces of requests and replies. One buffer
+ * is the NDEF file: the reader's message is read from it, and the answer is put there. While a command runs it is
  * empty, which means "need more time". */
 #include "tnep.h"
 #include "ble.h"
@@ -20,7 +19,7 @@
 #define ANSWER 1u
 #define MORE 2u
 #define STATUS_OCTETS 6u
-#define BUSY_NS TEDS_SECOND /* a tag does not hear when its answer was read: so long after it flash is not erased */
+#define BUSY_NS TEDS_SECOND /* a tag cannot notice that its answer was read, so flash is not erased for so long */
 enum { SUCCESS = 0x00, PROTOCOL_ERROR = 0x01, GARBLED = 0x80 };
 
 typedef struct piece {
@@ -68,7 +67,8 @@ static size_t put_charge(const teds_node *node, uint8_t *out)
     return at + 2;
 }
 
-/* Bluetooth LE out-of-band record (Core Specification Supplement, MIME type of Bluetooth SIG): which node to look for. */
+/* Bluetooth LE out-of-band record (Core Specification Supplement, MIME type of Bluetooth SIG): the address of this
+ * node. */
 static size_t put_out_of_band(const teds_node *node, uint8_t *out)
 {
     static const char type[] = "application/vnd.bluetooth.le.oob";
@@ -82,11 +82,11 @@ static size_t put_out_of_band(const teds_node *node, uint8_t *out)
     out[at + 8] = 1; /* random */
     out[at + 9] = 0x02;
     out[at + 10] = 0x1C;
-    out[at + 11] = 0x00; /* peripheral alone */
+    out[at + 11] = 0x00; /* only as peripheral */
     return at + 12;
 }
 
-/* Service parameters: a Tp record of TNEP 1.0. All services of the tag wait alike. */
+/* Service parameters: a Tp record of TNEP 1.0. All services of the tag have the same waiting times. */
 static size_t put_service(const teds_node *node, uint8_t *out, uint8_t marks, const char *name)
 {
     const size_t uri = strlen(name);
@@ -150,7 +150,7 @@ static void show_status(teds_node *node, uint8_t status)
     show_message(node, put_status(node->nfc.file + 2, TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS, status));
 }
 
-/* Te 00 and a piece, whose body is copied in. */
+/* Put Te 00 and a piece into the message; its body is copied. */
 static void show_piece(teds_node *node, const piece *own)
 {
     uint8_t *out = node->nfc.file + 2, *payload;
@@ -213,7 +213,7 @@ static void collect_piece(teds_node *node, const piece *came)
     }
     if (came->offset <= nfc->held) {
         for (size_t i = 0; i < came->length && came->offset + i < sizeof nfc->request; i++) {
-            nfc->request[came->offset + i] = came->body[i]; /* what is longer than maxMessage is refused all the same */
+            nfc->request[came->offset + i] = came->body[i]; /* a request longer than maxMessage is refused anyway */
         }
         nfc->held = (uint16_t)(came->offset + came->length);
         nfc->answered = false;
@@ -238,7 +238,7 @@ static void collect_piece(teds_node *node, const piece *came)
 
 bool teds_nfc_services_good(const teds_config *config)
 {
-    /* beside WLC 26, our Tp 41, id 45 and out-of-band 47: the initial message is one that fits the tag */
+    /* Besides WLC 26, our Tp 41, id 45 and out-of-band 47: the initial message must fit the tag. */
     const uint16_t configured = config->nfc.max_ndef;
     size_t octets = 160;
     for (size_t i = 0; i < config->nfc.service_count; i++) {
@@ -252,7 +252,7 @@ bool teds_nfc_services_good(const teds_config *config)
     return octets <= (configured != 0 && configured < TEDS_MAX_NDEF ? configured : TEDS_MAX_NDEF);
 }
 
-/* The place of a service of this name, from 1 on; 0: none. */
+/* Find the service with this name, from 1 on; 0: none. */
 static uint8_t find_service(const teds_node *node, const teds_ndef *came)
 {
     for (size_t i = 0; i < node->config->nfc.service_count; i++) {
@@ -264,8 +264,8 @@ static uint8_t find_service(const teds_node *node, const teds_ndef *came)
     return 0;
 }
 
-/* A message of the reader of another service. The answer is made in the buffer of our own requests: one reader has one
- * service at a time. */
+/* Answer a message for a service of the application. The answer uses the buffer of our own requests, since a reader
+ * uses one service at a time. */
 static void answer_other(teds_node *node, size_t length)
 {
     const teds_nfc_service *service = &node->config->nfc.services[node->nfc.other - 1];
@@ -283,7 +283,7 @@ static void answer_other(teds_node *node, size_t length)
     teds_wipe(node->nfc.request, sizeof node->nfc.request);
 }
 
-/* -- the conversation ---------------------------------------------------------------------------------------------- */
+/* -- messages of a reader ------------------------------------------------------------------------------------------ */
 
 static void answer_message(teds_node *node, size_t length)
 {
@@ -363,7 +363,7 @@ void teds_nfc_field(teds_node *node, bool present)
     }
 }
 
-/* The message in the file is whole: it is empty from here on, until the answer is there. */
+/* Take the message in the file; the file is empty from here on, until the answer is there. */
 void teds_nfc_came(teds_node *node, size_t length)
 {
     node->nfc.stage = TEDS_NFC_WRITTEN;

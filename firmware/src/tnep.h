@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The conversation with an NFC reader, over NDEF messages. */
+/* TNEP with an NFC reader, over NDEF messages. */
 #ifndef TEDS_SRC_TNEP_H
 #define TEDS_SRC_TNEP_H
 
@@ -11,13 +11,13 @@ enum { TEDS_NFC_QUIET, TEDS_NFC_WRITTEN };
 /* True if the application's services have names and room in the initial message. */
 bool teds_nfc_services_good(const teds_config *config);
 
-/* Show the initial message, at a start. */
+/* Put the initial message into the file, at a start. */
 void teds_nfc_start(teds_node *node);
 
-/* A reader has written a message of this length into the file. */
+/* Handle a message of this length that a reader has written into the file. */
 void teds_nfc_came(teds_node *node, size_t length);
 
-/* Answer the message that was written; show the initial message again if what it reports has changed. */
+/* Answer the message that was written; update the initial message if the facts in it have changed. */
 void teds_nfc_poll(teds_node *node);
 #endif
 

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The board's TransducerChannels, by their places in the port's table: what each is, its value, its safe state; and
- * whether the stored TransducerChannel TEDS describes this hardware (operation.md, 1). */
+/* The board's TransducerChannels, by their index in the port's table: kind, value and safe state; and whether the
+ * stored TransducerChannel TEDS describes this hardware (operation.md, 1). */
 #include "transducers.h"
 #include "clock.h"
 #include "datasheet.h"
@@ -100,7 +100,7 @@ void teds_go_safe(teds_node *node, int place)
 
 /* -- facts of the stored TransducerChannel TEDS -------------------------------------------------------------------- */
 
-/* Float32 seconds as ns, less 1 ppm; 0 if it is not positive or no number. */
+/* Float32 seconds as ns, less 1 ppm; 0 if it is not a positive number. */
 static uint64_t decode_period(uint32_t bits)
 {
     uint32_t exponent = bits >> 23 & 255;
@@ -108,7 +108,7 @@ static uint64_t decode_period(uint32_t bits)
     if (bits >> 31 != 0 || exponent == 0 || (exponent == 255 && (bits & 0x7FFFFF) != 0)) {
         return 0;
     }
-    if (exponent >= 127 + 20) { /* a million seconds replaces every longer one */
+    if (exponent >= 127 + 20) { /* longer periods count as a million seconds */
         return 1000000 * TEDS_SECOND;
     }
     ns = exponent >= 150 ? ns << (exponent - 150) : 150 - exponent < 64 ? ns >> (150 - exponent) : 0;

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Arm and the trigger (operation.md, 5): a session leaves the digest of a token, and a frame with the token on the bus
- * marks the time, starts streams that wait or stops actuators. */
+/* Arm and the trigger (operation.md, 5): a session stores the digest of a token; a frame with the token on the bus then
+ * marks the time, starts waiting streams or stops actuators. */
 #include "trigger.h"
 #include "clock.h"
 #include "crypto.h"

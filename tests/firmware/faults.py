@@ -62,8 +62,8 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_ABOUT_ANY_PAYLOAD": Change("about.c", "if (command->length != 0) {", "if (command->length > 9) {"),
     "FAULT_ABOUT_BY_RADIO": Change(
         "commands.c",
-        "return teds_in_factory(node) || origin->arrival->kind == TEDS_CAN ? 0 : -TEDS_NOT_PERMITTED;",
-        "return 0;",
+        "if (!teds_in_factory(node) && origin->arrival->kind != TEDS_CAN) {",
+        "if (false) {",
     ),
     "FAULT_LOCATE_FOR_ANYONE": Change(
         "commands.c",
@@ -73,11 +73,11 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_LOCATE_FOR_LONG": Change("about.c", "#define LONGEST_SECONDS 60u", "#define LONGEST_SECONDS 61u"),
     "FAULT_MANAGE_UNKNOWN": Change(
         "commands.c",
-        "    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */",
-        "    case TEDS_MANAGE: return -TEDS_UNKNOWN_COMMAND;\n    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */",
+        "    default: return -TEDS_NOT_PERMITTED; /* Close, and the commands of operation.md */",
+        "    case TEDS_MANAGE: return -TEDS_UNKNOWN_COMMAND;\n    default: return -TEDS_NOT_PERMITTED; /* Close, and the commands of operation.md */",
     ),
     "FAULT_PRESSED_CLAIMS": Change(
-        "can.c", " ||\n        frame->data[6] == 1) { /* a pressed button claims nothing */", ") {"
+        "can.c", " ||\n        frame->data[6] == 1) { /* a pressed button claims no address */", ") {"
     ),
     # -- the agreement
     "FAULT_TRANSCRIPT_LABEL_WITHOUT_00": Change(
@@ -85,7 +85,7 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_TRANSCRIPT_EPOCH_NOT_PLUS_1": Change(
         "agree.c",
-        "    /* reply_head: nonceN, epoch, En as in the reply */\n",
+        "    /* reply_head: nonceN, epoch and En, as in the reply. */\n",
         "    uint8_t head[85];\n    memcpy(head, reply_head, 85);\n    teds_put32(head + 16, node->state.epoch);\n"
         "    reply_head = head;\n",
     ),
@@ -274,7 +274,7 @@ CHANGES: Final[dict[str, Change]] = {
     # -- the agreement, once more
     "FAULT_TRANSCRIPT_EPOCH_LITTLE_ENDIAN": Change(
         "agree.c",
-        "    /* reply_head: nonceN, epoch, En as in the reply */\n",
+        "    /* reply_head: nonceN, epoch and En, as in the reply. */\n",
         "    uint8_t head[85];\n    const uint32_t next = node->state.epoch + 1;\n    memcpy(head, reply_head, 85);\n"
         "    memcpy(head + 16, &next, 4);\n    reply_head = head;\n",
     ),
@@ -283,7 +283,7 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_TRANSCRIPT_DIGEST_OF_DATA_BLOCK": Change(
         "agree.c",
-        "    /* reply_head: nonceN, epoch, En as in the reply */\n",
+        "    /* reply_head: nonceN, epoch and En, as in the reply. */\n",
         "    uint8_t image[2048];\n    teds_source_read(node, &source, 0, image, source.length);\n"
         "    const teds_part block = {image + 4, source.length - 6};\n    teds_sha256_parts(node, &block, 1, teds);\n",
     ),
@@ -746,7 +746,7 @@ ON_THE_BUS: Final[dict[str, Change]] = {
     ),
     "FAULT_ADDRESS_TOO_SOON": Change(
         "commands.c",
-        "    node->can.moves_to = command->payload[0]; /* when the reply has left */\n"
+        "    node->can.moves_to = command->payload[0]; /* once the reply has been sent */\n"
         "    node->can.moves_link = origin->link;\n",
         "    teds_address_move(node, command->payload[0]);\n",
     ),

@@ -232,7 +232,7 @@ PATTERNS = (
     ),
     Pattern(
         "of the questions to everyone during a reply the newest is answered",
-        "CanServer._everyone",
+        "CanServer._on_broadcast",
         "state.replying is not None",
         "False",
         "tests/node/test_can_server.py",

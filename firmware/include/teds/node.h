@@ -21,7 +21,7 @@
 extern "C" {
 #endif
 
-/** What the functions that return int return, beside 0. */
+/** Results of the functions that return int, besides 0. */
 enum {
     TEDS_E_USAGE = -1,    /**< a port or configuration that cannot be: sizes, unit, channels, no cryptography */
     TEDS_E_FLASH = -2,    /**< flash failed, or reads back other than written */
@@ -69,12 +69,12 @@ typedef struct teds_nfc_service {
     /** Answer an NDEF message of the service's reader; called from teds_node_poll. `out` gets the records that follow
      * the status record in the answer: none of them begins a message (MB), the last one ends it (ME). Return their
      * octets, at most `room`; 0 if there are none; a negative number for a message that is not understood. `message` is
-     * whole, without chunks; the one that selects the service contains the Ts record. It is not authenticated: anyone
-     * with a reader can send it. */
+     * whole, without chunks; the one that selects the service contains the Ts record. It is not authenticated: any
+     * reader can send it. */
     int (*answer)(void *user, const uint8_t *message, size_t length, uint8_t *out, size_t room);
 } teds_nfc_service;
 
-/** What an application configures. It must outlive the node. */
+/** Configuration by the application. It must outlive the node. */
 struct teds_config {
     uint8_t uuid[10];        /**< used at the very first start only; afterwards the stored one counts */
     const teds_fixed *fixed; /**< TEDS of the firmware, NULL: none */
@@ -84,8 +84,8 @@ struct teds_config {
     /** NFC, if the library was compiled with it. */
     struct {
         bool present;                     /**< the board has an antenna: a tap is a tap, and its bus is never one */
-        uint8_t wt_int;                   /**< a reader looks for an answer after 2^(wt_int / 4 - 1) ms; multiples of 4 */
-        uint8_t n_wait;                   /**< how often it may look again, at most 15 */
+        uint8_t wt_int;                   /**< answers are read after 2^(wt_int / 4 - 1) ms; multiples of 4 */
+        uint8_t n_wait;                   /**< how often it may read again, at most 15 */
         uint16_t max_ndef;                /**< longest NDEF message of this tag, 160 or more; 0: #TEDS_MAX_NDEF */
         const teds_nfc_service *services; /**< services of the application on the same tag, NULL: none */
         size_t service_count;             /**< their number; their records share the initial message with the node's */
@@ -152,8 +152,8 @@ void teds_can_start(teds_node *node, uint64_t now);
 /** Take a frame that came; `tick` is its end. From the main loop, never from an interrupt: keep a ring of 20 frames. */
 void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick);
 
-/** Return the next frame that may leave now; false: none. Ask when the controller has room for one: commands and replies
- * go before data, and what is still here can be taken back. */
+/** Return the next frame to send; false: none. Call it when the controller has room for one: commands and replies are
+ * sent before data, and frames that are still here can be withdrawn. */
 bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now);
 
 /** The controller is off the bus: all CAN links are lost. Restart it at once, and call teds_can_start: the node itself
@@ -217,7 +217,7 @@ void teds_nfc_field(teds_node *node, bool present);
  * from that moment on. False if the message is empty or too long. */
 bool teds_nfc_written(teds_node *node, const uint8_t *message, size_t length);
 
-/** Return the NDEF message that the tag has to show now; look after each teds_node_poll. */
+/** Return the NDEF message for the tag to show now; call it after each teds_node_poll. */
 const uint8_t *teds_nfc_message(const teds_node *node, size_t *length);
 
 /** Octets of the longest answer to an APDU. */

@@ -15,7 +15,7 @@ extern "C" {
 /** The station at the other end: F1 to F7 on CAN, #TEDS_LINK_NFC, #TEDS_LINK_BLE and up, one for each connection. */
 typedef uint8_t teds_link;
 
-/** What an application configures: defined in teds/node.h. */
+/** Configuration by the application: defined in teds/node.h. */
 typedef struct teds_config teds_config;
 
 /** One node: static memory of the board, started by teds_node_init. */
@@ -146,23 +146,23 @@ typedef struct teds_line {
     bool fd;
     uint8_t flow;                    /* a flow control is due: its first octet, 0: none */
     uint8_t refuses, refused;        /* a refusal as a single frame: its reason, 0: none; of which transaction */
-    bool asked, asked_fd;            /* a functional Identify waits for its time */
+    bool asked, asked_fd;            /* a broadcast waits to be answered */
     uint8_t asked_transaction;
-    /* what is being sent */
+    /* The message being sent. */
     uint8_t out_state, out_number, out_block, out_waits;
     uint16_t out_length, out_at;
     uint32_t out_gap;             /* ns between consecutive frames */
     const uint8_t *out;
-    teds_stored_reply *out_reply; /* NULL: it is everyone's */
-    uint32_t touched;             /* the later the greater */
+    teds_stored_reply *out_reply; /* NULL: a broadcast answer */
+    uint32_t touched;             /* order of use: a greater value is later */
     uint64_t out_due;             /* next frame, or when a flow control is given up */
     uint64_t asked_due;
 } teds_line;
 
 #if TEDS_MANAGED
-/* Of 128.23: the upload that lives, the last one that began, and a restart that is due when its reply has left. */
+/* Of 128.23: the present upload, the start of the last one, and a restart that is due once its reply was sent. */
 typedef struct teds_managed {
-    teds_session *upload_of;   /* NULL: none lives */
+    teds_session *upload_of;   /* NULL: no upload */
     uint64_t upload_until, sha_until;
     uint32_t upload_octets;    /* of the whole image */
     bool begun, restarts;
@@ -172,27 +172,27 @@ typedef struct teds_managed {
 #endif
 
 typedef struct teds_can {
-    uint8_t address, moves_to; /* moves_to: where 128.10 leads once its reply has left; 0: nowhere */
+    uint8_t address, moves_to; /* moves_to: the address of 128.10, used once its reply was sent; 0: none */
     teds_link moves_link;
     bool announces;
     uint8_t bus_offs; /* in a row */
     uint8_t announced_at;
-    uint8_t moves; /* because of another node's claim, since the start or the last ten minutes without a conflict */
-    bool gives_up; /* this address, at move_at */
-    bool pressed;  /* to be announced now */
-    bool rx_wanted; /* another pair was refused because of the long request that is coming in */
+    uint8_t moves; /* caused by another node's claim, since the start or the last ten minutes without a conflict */
+    bool gives_up; /* leave this address at move_at */
+    bool pressed;  /* announce the press now */
+    bool rx_wanted; /* another pair was refused during the reception of the present long request */
     bool turned_away_fd;
-    uint8_t turned_away, turned_away_transaction; /* a station that finds no line is refused; 0: none */
-    /* the one long request that may be coming in */
+    uint8_t turned_away, turned_away_transaction; /* a station without a line, to be refused; 0: none */
+    /* The one long request that may be being received. */
     uint8_t rx_number, rx_block, rx_frame; /* rx_frame: octets of its first frame, and so of all but the last */
     uint16_t rx_length, rx_at;
     teds_line *rx_line;
-    uint64_t rx_until, rx_ends; /* its next frame, the whole of it */
-    uint64_t announce_due, back_at; /* back_at: after bus-off it is silent until then */
+    uint64_t rx_until, rx_ends; /* time limits of its next frame, and of the whole request */
+    uint64_t announce_due, back_at; /* back_at: end of the silence after bus-off */
     uint64_t move_at, conflict_at;
     uint32_t touches;
 #if TEDS_OPERATION
-    /* the one data message that is being sent */
+    /* The one data message that is being sent. */
     teds_stream *data_stream;
     uint64_t data_free_at;
     uint16_t data_at, data_length;
@@ -200,20 +200,20 @@ typedef struct teds_can {
     uint8_t data[TEDS_MESSAGE];
 #endif
     uint8_t heard[30];
-    uint8_t everyone[27]; /* the answer to everyone: of all lines, but for its first octet, which leaves at once */
+    uint8_t broadcast_answer[27]; /* shared by all lines, except its first octet, which is sent at once */
     uint32_t announced[20];
-    uint32_t pressed_at, pressed_paid; /* the last press announced, and until when presses are paid for */
+    uint32_t pressed_at, pressed_paid; /* the last announced press, and the budget of further ones */
 } teds_can;
 
 #if TEDS_NFC
 typedef struct teds_nfc {
     bool selected, shows_initial, collects, answered;
     uint8_t stage, opened, file_open;
-    uint8_t other; /* the application's service that is selected, from 1 on; 0: none */
-    teds_stored_reply *reply; /* it is read in pieces */
+    uint8_t other; /* the selected service of the application, from 1 on; 0: none */
+    teds_stored_reply *reply; /* the reply that the reader fetches in pieces */
     uint16_t transaction, total, held, answered_transaction, length, came;
-    uint64_t tick, busy_until; /* busy_until: its reader has something to read, or will ask on */
-    uint8_t shown[23]; /* the Identify that the initial message holds */
+    uint64_t tick, busy_until; /* busy_until: until then a reader may fetch an answer or continue its request */
+    uint8_t shown[23]; /* the Identify in the initial message */
     uint8_t request[TEDS_MAX_MESSAGE];
     uint8_t file[2 + TEDS_MAX_NDEF]; /* NLEN, message */
 } teds_nfc;
@@ -232,7 +232,7 @@ typedef struct teds_ble {
     bool was_tapped;
     uint64_t tapped_at;
 #if TEDS_OPERATION
-    uint64_t data_free_at; /* all connections are one bus */
+    uint64_t data_free_at; /* all connections share one time on air */
 #endif
     teds_ble_line lines[TEDS_BLE_CONNECTIONS];
 } teds_ble;
@@ -242,19 +242,20 @@ typedef struct teds_ble {
 struct teds_node {
     const teds_port *port;
     const teds_config *config;
-    uint8_t slot; /* the one that counts */
+    uint8_t slot; /* the current slot */
     uint8_t firmware; /* flags of About, as last read */
     bool free_slot_dirty, old_slot_due;
-    bool identity_changed; /* broadcast replies on CAN that began before hold the old reply to Identify */
-    bool spare_slot_fails; /* it could not be erased when that was last tried: the node answers and writes nothing */
+    bool identity_changed; /* broadcast answers on CAN that began before have the old reply to Identify */
+    bool spare_slot_fails; /* the spare slot could not be erased: the node answers, but writes nothing */
     teds_session *staging_of; /* NULL: none */
     uint16_t staging_end;
     uint32_t slot_counter, records_end;
     uint64_t opens; /* c */
-    uint64_t staged_until; /* then another session may take the staging */
-    uint64_t old_slot_by; /* then the old slot is erased, even if a station still waits for a reply */
+    uint64_t staged_until; /* from then on another session may use the staging */
+    uint64_t old_slot_by; /* from then on the old slot is erased, even if a station waits for a reply */
     uint64_t locate_until; /* 0: it does not blink */
-    uint64_t address_again, strangers_again; /* from then on: a write of the address, a plain Read or List beside streams */
+    /* earliest time of another write of the address; of another plain Read, List or About during streams */
+    uint64_t address_again, strangers_again;
 #if TEDS_OPERATION
     uint32_t safe, stopped; /* bits by place */
     uint64_t missed;

@@ -1,9 +1,9 @@
-// The API of the base station. Every refusal becomes a Refusal with cause and cure.
+// The API of the base station. Every refusal becomes a Refusal with cause and remedy.
 
 const ROOT = new URL("api/v1/", document.baseURI);
-const PATIENCE = 60000; // ms; what waits for a person answers at once and is followed by events
+const PATIENCE = 60000; // ms; requests that wait for a user are answered at once, and events follow
 
-/** What the station, or the way to it, said no to. */
+/** A refusal by the station, or a failed connection. */
 export class Refusal extends Error {
   constructor(status, code, message, hint) {
     super(message);
@@ -32,7 +32,7 @@ async function ask(method, path, body, { signal, keepalive, match, patience = PA
     throw new Refusal(0, "unreachable", "The base station is not responding.", "Is `teds-provision ncap run` still running?");
   }
   const said = await answer.json().catch(() => null);
-  const tag = answer.headers.get("ETag"); // of the datasheet that was shown: a write is for that one alone
+  const tag = answer.headers.get("ETag"); // of the shown datasheet: a write applies only to that one
   if (answer.ok) return tag ? { ...said, tag } : (said ?? {});
   const why = said?.error ?? {};
   throw new Refusal(answer.status, why.code ?? String(answer.status), why.message ?? `Refused (${answer.status}).`, why.hint);

@@ -1,8 +1,9 @@
-// Elements, icons, lists. Text goes in by textContent alone: names of nodes and channels are hostile.
+// Elements, icons, lists. Text is set only by textContent: names of nodes and channels are hostile.
 
 const UNSEEN = /[\p{Cc}\p{Cf}\p{Cn}\p{Co}\p{Zl}\p{Zp}]/gu;
 
-/** Text that others wrote, without what nobody sees: U+202E turns what people read, a zero-width letter makes two names look like one. */
+/** Text from others, without invisible characters: U+202E reverses text, and a zero-width letter makes two names look
+ * alike. */
 const seen = (words) => String(words).replace(UNSEEN, "\ufffd");
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -31,13 +32,13 @@ export function put(element, ...children) {
   return element;
 }
 
-/** Replace what is in an element. */
+/** Replace the children of an element. */
 export function fill(element, ...children) {
   element.replaceChildren();
   return put(element, ...children);
 }
 
-/** Set text only where it changed: a browser then paints nothing. */
+/** Set text only if it has changed, so that the browser does not repaint. */
 export function text(element, words) {
   const shown = seen(words);
   if (element.textContent !== shown) element.textContent = shown;
@@ -66,7 +67,7 @@ const PATHS = {
   gauge: "M2 12a6.5 6.5 0 1 1 12 0M8 11l3-4",
 };
 
-/** A small line drawing; said by the text beside it, so hidden from screen readers. */
+/** An icon, hidden from screen readers because the text beside it has the same meaning. */
 export function icon(name) {
   const svg = document.createElementNS(SVG, "svg");
   svg.setAttribute("viewBox", "0 0 16 16");
@@ -78,12 +79,12 @@ export function icon(name) {
   return svg;
 }
 
-/** A word with a sign and a tone (good, warn, bad, plain, busy): never colour alone. */
+/** A word with an icon and a tone (good, warn, bad, plain, busy): never colour alone. */
 export function chip(tone, sign, words, title) {
   return h("span", { class: `chip ${tone}`, title }, icon(sign), h("span", {}, words));
 }
 
-/** Keep the children of `parent` in step with `items`: made once for each key, updated in place, so focus stays. */
+/** Keep the children of `parent` in step with `items`: one element per key, updated in place, so that focus is kept. */
 export function keyed(parent, items, keyOf, make, update) {
   const old = parent.keyed ?? new Map();
   const now = new Map();
@@ -111,7 +112,7 @@ export function field(label, control, hint) {
   return h("div", { class: "field" }, h("label", { for: control.id }, label), control, said);
 }
 
-/** A button; `busy(promise)` on it disables it and says so until the promise ends. */
+/** A button; `busy(promise)` disables it and shows that until the promise ends. */
 export function button(words, props = {}, sign = null) {
   const element = h("button", { type: "button", ...props }, sign ? icon(sign) : null, h("span", {}, words));
   element.busy = async (work) => {
@@ -128,12 +129,12 @@ export function button(words, props = {}, sign = null) {
   return element;
 }
 
-/** Tell people who listen, politely. */
+/** Announce a text to screen readers, politely. */
 export function say(words) {
   text(document.getElementById("say"), words);
 }
 
-/** A message at the edge: errors stay until they are closed, good news goes. */
+/** A notice at the edge: errors stay until closed, success disappears. */
 export function toast(tone, words, hint) {
   const box = document.getElementById("toasts");
   const close = () => element.remove();
@@ -149,7 +150,7 @@ export function toast(tone, words, hint) {
   if (tone !== "bad") setTimeout(close, 6000);
 }
 
-/** Cause and cure, as a block inside a panel. */
+/** Cause and remedy, as a block inside a panel. */
 export function trouble(error) {
   return h(
     "div",
@@ -159,7 +160,7 @@ export function trouble(error) {
   );
 }
 
-/** What to do where there is nothing yet. */
+/** What to do next, if there is nothing to show yet. */
 export function empty(title, ...what) {
   return h("div", { class: "empty" }, h("p", { class: "lead" }, title), ...what);
 }

@@ -1,4 +1,4 @@
-// How numbers, times and names are shown.
+// Formats numbers, times and names.
 
 /** Digits after the point so that the uncertainty has two figures; without one, five figures in all. */
 function places(value, uncertainty) {
@@ -7,7 +7,8 @@ function places(value, uncertainty) {
   return size >= 1e5 || size === 0 ? 0 : Math.min(9, Math.max(0, 4 - Math.floor(Math.log10(size))));
 }
 
-/** A value as people read it; "none" where there is none. Very large and very small ones as 1.2345e-9. An angle that rounds to the end of its turn is its beginning. */
+/** A value for display; "none" if there is none. Very large and very small ones as 1.2345e-9. An angle that rounds to
+ * the end of its turn is shown as the beginning. */
 export function number(value, uncertainty = null, turn = null) {
   if (typeof value !== "number" || !Number.isFinite(value)) return "none";
   const size = Math.abs(value);
@@ -17,13 +18,13 @@ export function number(value, uncertainty = null, turn = null) {
   return sign(turn && Number(text) >= Number((turn.low + turn.size).toFixed(digits)) ? turn.low.toFixed(digits) : text);
 }
 
-/** A value of a channel in its unit: what the rounding of a conversion leaves of 0 is 0. */
+/** A channel's value in its unit; a rest from rounding in the conversion is shown as 0. */
 export function reading(value, channel, uncertainty = channel.uncertainty) {
   const size = Math.max(...[channel.low, channel.high, channel.scale?.offset].map((end) => Math.abs(end) || 0));
   return number(Math.abs(value) < 1e-9 * size ? 0 : value, uncertainty, channel.turn);
 }
 
-/** The last value of a channel in words where there is no number: never measured, raw values alone, not valid. */
+/** Text instead of the last value if there is no number: never measured, raw values only, not valid. */
 export function figure(last, channel) {
   if (!last) return "no value yet";
   if (typeof last.value === "number") return reading(last.value, channel);
@@ -38,14 +39,14 @@ function rawOf(last) {
   return typeof last.raw === "string" && last.raw.length <= 16 ? last.raw : "";
 }
 
-/** Why a channel shows no number, for whoever points at it; empty where nothing says so. */
+/** Tooltip: why a channel shows no number; empty if unknown. */
 export function whyNoNumber(last, channel, report) {
   if (!last || typeof last.value === "number") return "";
   const reasons = (report?.invalid_why ?? []).filter((one) => one.channel === channel.number);
   return channel.problem ?? reasons.map((one) => `${one.count}: ${one.why}`).join("; ");
 }
 
-/** Like number, without the zeros that a fixed width needs. */
+/** Like number, without trailing zeros. */
 export function short(value) {
   if (typeof value !== "number" || !Number.isFinite(value)) return "none";
   return sign(String(Number(value.toPrecision(4))));
@@ -68,7 +69,7 @@ export function hertz(rate) {
   return rate >= 1000 ? `${short(rate / 1000)} kHz` : `${short(rate)} Hz`;
 }
 
-/** How long ago, in words that change seldom. */
+/** How long ago, rounded so that the text seldom changes. */
 export function age(seconds) {
   if (typeof seconds !== "number" || !Number.isFinite(seconds)) return "never";
   if (seconds < 1.5) return "now";
@@ -78,7 +79,7 @@ export function age(seconds) {
   return `${Math.round(seconds / 86400)} days ago`;
 }
 
-/** Clock time of a unix second or an ISO string: 14:03:07; with the day where it is not today. */
+/** Clock time of a unix second or an ISO string: 14:03:07; with the date if it is not today. */
 export function clock(time) {
   if (time === null || time === undefined || time === "") return "never";
   const moment = typeof time === "number" ? new Date(time * 1000) : new Date(time);
@@ -89,7 +90,7 @@ export function clock(time) {
   return `${moment.getFullYear()}-${pad(moment.getMonth() + 1)}-${pad(moment.getDate())} ${hours}`;
 }
 
-/** What a node is called: its name, else the first digits of its UUID. */
+/** Display name of a node: its name, or else the first digits of its UUID. */
 export function nameOf(node) {
   return node?.name || (node?.uuid ? `node ${node.uuid.slice(0, 8)}` : "unknown node");
 }
@@ -102,10 +103,10 @@ export function namesOf(nodes, most = 8) {
   return names.length > most + 1 ? `${names.slice(0, most).join(", ")} and ${names.length - most} more` : names.join(", ");
 }
 
-/** Order of nodes as people look for them: by name, "finger 2" before "finger 10"; namesakes by UUID. */
+/** Order of nodes in lists: by name, "finger 2" before "finger 10"; equal names by UUID. */
 export const byName = (one, other) => compare(nameOf(one), nameOf(other)) || compare(one.uuid, other.uuid);
 
-/** What a channel is called. */
+/** Display name of a channel. */
 export function channelName(channel) {
   return channel.name || `channel ${channel.number}`;
 }
@@ -134,7 +135,7 @@ function dated(time) {
   return words.length > 8 ? ` on ${words.slice(0, 10)}` : ` at ${words}`;
 }
 
-/** Tone, sign, word and meaning of the verdict on a node or a datasheet; that on an absent node is grey, with its time. */
+/** Tone, icon, word and meaning of the verdict on a node or a datasheet; for an absent node in grey, with its time. */
 export function verdict(of) {
   const [tone, sign, words, why] = judged(of);
   if (of.present !== false || tone === "plain") return [tone, sign, words, why];

@@ -1,13 +1,13 @@
-// The WebSocket: values and events as they come. A connection that went silent is seen within two seconds.
+// The WebSocket: values and events as they come. A silent connection is noticed within two seconds.
 
 import { get, liveAddress } from "./api.js";
 
-const SILENCE = 1500; // ms without a beat (two a second): the connection is lost, whatever the socket believes
+const SILENCE = 1500; // ms without a beat (two a second): the connection counts as lost
 const LOOK = 200; // ms between looks
-const NOT_GOOD = 1008; // the station closed it: this browser's token is not good any more
+const NOT_GOOD = 1008; // the station closed it: this browser's token is no longer valid
 const WAIT = [300, 600, 1000, 2000, 3000]; // ms before the next try
 
-/** Connects, watches, connects again. `on.state(state, error)`: "live", "lost", "signed out". `on.event(event)`. */
+/** Connects, watches, reconnects. `on.state(state, error)`: "live", "lost", "signed out". `on.event(event)`. */
 export class Live {
   constructor(on) {
     this.on = on;
@@ -54,7 +54,7 @@ export class Live {
     try {
       await get("status", { signal: AbortSignal.timeout(2000) });
     } catch (error) {
-      // 429: a good token is never slowed down, so this one is none.
+      // 429: the station never delays a valid token, so this one is not valid.
       if (error.status === 401 || error.status === 429) return this.on.state("signed out", error);
     }
     return this.connect();

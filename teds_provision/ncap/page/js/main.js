@@ -1,4 +1,4 @@
-// Starts the page: header, connection, and the view that the address names.
+// Starts the page: header, connection, and the view named by the address.
 
 import { change, post } from "./api.js";
 import { button, fill, h, icon, say, text, toast, trouble } from "./dom.js";
@@ -24,7 +24,7 @@ const STATUS_EVERY = 2000; // ms
 let shown = { name: null, view: null };
 
 function route() {
-  const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/"); // views and hex digits: nothing to decode
+  const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/"); // views and hex digits need no decoding
   return Object.hasOwn(VIEWS, name) ? { name, rest } : { name: "nodes", rest: [] };
 }
 
@@ -124,7 +124,7 @@ async function find() {
   }
 }
 
-/** What a person is at that must not be taken from under the hands; "" where nothing is. */
+/** What the user is doing that must not be interrupted; "" if nothing. */
 function occupied() {
   if (document.querySelector("[data-held]")) return "you are holding an actuator";
   const at = document.activeElement;
@@ -132,7 +132,7 @@ function occupied() {
   return typing ? "you are typing" : "";
 }
 
-/** A tap opens that very node and marks it, wherever the person was: no button is needed. */
+/** A tap opens and marks that node, whatever page is shown: no click is needed. */
 function tapped() {
   const { uuid } = state.tapped;
   const node = state.nodes.get(uuid);
@@ -144,9 +144,9 @@ function tapped() {
     return;
   }
   const run = state.runs.get(uuid) ?? state.runs.get("next");
-  // A whole provisioning may be over before this frame: whoever asked for it wants to see how it went.
+  // A whole provisioning may end before this frame, and the user wants to see its result.
   const asked = ["waiting", "running"].includes(run?.state) || performance.now() - (run?.heard ?? -Infinity) < 3000;
-  // Only where nothing else is open: whoever looks at a plot or another node keeps it, whatever is put on a reader.
+  // Only if nothing else is open: a tap must not take away the plot or node that the user is looking at.
   const free = /^#?\/?(nodes\/?)?$/.test(location.hash) || location.hash.startsWith("#/nodes/next");
   if (asked && (free || here)) location.hash = `#/nodes/${uuid}/provision`;
   else if (free) location.hash = `#/nodes/${uuid}`;

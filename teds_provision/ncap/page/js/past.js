@@ -1,24 +1,24 @@
-// The last hour of a channel, as the station keeps it: fetched once, then only what is new. A reload loses nothing.
+// The last hour of a channel from the station: fetched once, then only new bins. A reload loses nothing.
 
 import { get, paths } from "./api.js";
 import { now, ringOf } from "./state.js";
 
 const HOUR = 3600; // s
-const FINE = 58; // s of which the station has bins of 10 ms, less what may pass until it answers
-const LIVE = 120; // s that the live curves show
+const FINE = 58; // s for which the station has bins of 10 ms, less some time for its answer
+const LIVE = 120; // s shown by the live curves
 
 const NOTHING = { bin: 1, time: [], low: [], high: [], count: [], invalid: [], lost: [], segment: [], segments: [], rate: null };
 const LISTS = ["time", "low", "high", "count", "invalid", "lost", "segment"];
 
-/** SI unit of the newest segment of these bins; undefined where there are none. */
+/** SI unit of the newest segment of these bins; undefined without bins. */
 const newestUnit = (bins) => unitOf(bins, bins.segment.at(-1));
-const RAW = "raw"; // in place of the SI unit: numbers of a channel without calibration
+const RAW = "raw"; // used instead of an SI unit for a channel without calibration
 const unitOf = (bins, segment) => {
   const found = bins.segments.find((one) => one.id === segment);
   return found?.raw ? RAW : found?.unit;
 };
 
-/** Bins of a channel between two moments, SI; none where nothing was measured. */
+/** Bins of a channel between two moments, SI; empty if nothing was measured. */
 export async function between(uuid, number, from, until, points) {
   try {
     return await get(`${paths.past(uuid)}?channel=${number}&from=${from.toFixed(3)}&until=${until.toFixed(3)}&points=${points}`);
@@ -35,17 +35,18 @@ export class Hour {
     this.asking = false;
   }
 
-  /** Fetch what came since; quietly nothing where the station does not answer: the page says so elsewhere. */
+  /** Fetch new bins. Errors are ignored: the page reports a lost station elsewhere. */
   async refresh() {
     if (this.asking) return;
     this.asking = true;
     try {
       const held = this.bins.time;
-      // More than a minute is asked for, so that it comes in bins of a second; the last one held was not whole yet.
+      // Request more than a minute, so that bins are a second wide; the last one held was not complete yet.
       const from = held.length ? Math.min(held.at(-1), now() - 70) : now() - HOUR;
       const fresh = await between(this.uuid, this.number, from, now() + 5, HOUR);
       const first = fresh.time[0] ?? Infinity;
-      const back = held.length && fresh.time.length && fresh.time.at(-1) < held.at(-1) - 5; // the station's clock was set
+      // the station's clock was set back
+      const back = held.length && fresh.time.length && fresh.time.at(-1) < held.at(-1) - 5;
       const old = held.findIndex((time) => time > now() - HOUR);
       const kept = back || old < 0 ? [0, 0] : [old, held.findLastIndex((time) => time < first) + 1];
       const bins = { ...this.bins, bin: 1, rate: fresh.rate };
@@ -53,13 +54,13 @@ export class Hour {
       bins.segments = [...this.bins.segments.filter((one) => !fresh.segments.some((other) => other.id === one.id)), ...fresh.segments];
       this.bins = bins;
     } catch {
-      // told by the connection
+      // The connection reports this.
     } finally {
       this.asking = false;
     }
   }
 
-  /** SI unit of the values that come now; undefined where none came yet. */
+  /** SI unit of the present values; undefined if there are none yet. */
   get unit() {
     return newestUnit(this.bins);
   }
@@ -76,7 +77,7 @@ export class Hour {
   }
 }
 
-/** Fill what a live curve shows with what was measured before this page was opened. */
+/** Fill a live curve with values measured before this page was opened. */
 export async function seed(uuid, number) {
   const time = now();
   const [rough, fine] = await Promise.all([between(uuid, number, time - LIVE, time - FINE, LIVE), between(uuid, number, time - FINE, time + 1, HOUR)]);
@@ -87,7 +88,7 @@ export async function seed(uuid, number) {
     bins.time.forEach((at, place) => {
       const [low, high] = [bins.low[place] ?? NaN, bins.high[place] ?? NaN];
       if (bins === rough && at >= (fine.time[0] ?? Infinity)) return;
-      if (unitOf(bins, bins.segment[place]) !== unit) return; // of a board that measured something else then
+      if (unitOf(bins, bins.segment[place]) !== unit) return; // from an earlier board that measured another quantity
       if (segment !== undefined && segment !== bins.segment[place]) points.push([at, NaN]);
       segment = bins.segment[place];
       points.push([at, low]);
@@ -97,11 +98,9 @@ export async function seed(uuid, number) {
   ringOf(uuid, number).before(points);
 }
 
-/**
- * Bins as `Ring.bins` gives points: three entries for each of `columns`, the least, the greatest, and null where the line
- * ends. It ends where nothing came for longer than `silence`, where nothing was valid, and where a new segment begins
- * (another calibration or zero). Bins in another SI unit than `unit` are left out, unless none is given.
- */
+/** Bins in the form of `Ring.bins`: three entries per column: least, greatest, and null if the line ends. It ends
+ * before a gap longer than `silence`, if no value was valid, and before a new segment (another calibration or zero).
+ * Bins in another SI unit than `unit` are left out, unless none is given. */
 export function columnsOf(bins, from, to, columns, silence, unit) {
   const out = new Array(3 * columns).fill(undefined);
   const width = (to - from) / columns;

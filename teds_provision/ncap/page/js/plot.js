@@ -1,4 +1,4 @@
-// Curves that move: one frame per unit, drawn from the rings, at most 20 times a second and less where drawing is slow.
+// Moving curves: one frame per unit, drawn from the rings at most 20 times a second, and less often if drawing is slow.
 
 import { h, fill, text } from "./dom.js";
 import { count, figure, hertz, number } from "./format.js";
@@ -8,19 +8,19 @@ import { toShown } from "./shapes.js";
 import { changed, now, on, ringOf, scaleOf, state, streamedOf } from "./state.js";
 
 const FRAME = 50; // ms between two drawings
-const SHARE = 0.35; // of the time that drawing may take
-const BEHIND = 0.25; // s: the right edge lies so far back, so that what comes in batches does not jump
+const SHARE = 0.35; // most of the time that drawing may take
+const BEHIND = 0.25; // s by which the right edge lags, so that values that come in batches do not jump
 const COLOURS = 8;
 const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3]];
-const PAINT = 17; // ms from one frame to the next of a browser that is not busy
+const PAINT = 17; // ms between two frames of an idle browser
 
-const LIVE = 120; // s that are drawn from what came to this page; more comes from the station's memory
-const ASK = 3000; // ms between two looks at that memory
-const POINTS = 900; // bins of a stretch that is looked at closely
+const LIVE = 120; // s drawn from data received by this page; older data come from the station's history
+const ASK = 3000; // ms between two requests for that history
+const POINTS = 900; // bins of a zoomed range
 
 export const WINDOWS = [10, 30, 120, 600, 3600];
 
-/** Colours of the theme that is on now. */
+/** Colours of the present theme. */
 function theme() {
   const style = getComputedStyle(document.documentElement);
   const read = (name) => style.getPropertyValue(name).trim();
@@ -34,7 +34,7 @@ function theme() {
   };
 }
 
-/** A channel as a plot shows it; one without calibration by its raw numbers, in a frame of their own. */
+/** A channel for a plot; one without calibration by its raw numbers, in a frame of its own. */
 export function plotted(uuid, channel, label) {
   const { number, problem } = channel;
   return problem ? { uuid, number, label, unit: "raw, not calibrated", uncertainty: null, turn: null, problem } : { uuid, number, label, unit: channel.unit ?? "", uncertainty: channel.uncertainty, turn: channel.turn, problem };
@@ -45,8 +45,8 @@ export class LivePlot {
   constructor(channels) {
     this.channels = channels;
     this.window = 30;
-    this.paused = null; // the time at the right edge while it stands
-    this.range = null; // [from, to] of the stretch that is looked at closely
+    this.paused = null; // the time at the right edge while paused
+    this.range = null; // [from, to] of the zoomed range
     this.zoomed = new Map(); // its bins, by channel
     this.hours = new Map(); // Hour by channel
     this.onzoom = () => {};
@@ -54,7 +54,7 @@ export class LivePlot {
     this.drawn = 0;
     this.skipped = 0;
     this.next = 0;
-    this.began = 0; // when the last drawing began, until the frame after it
+    this.began = 0; // start of the last drawing, until the next frame
     this.second = { at: performance.now(), frames: 0, received: state.received };
     this.charts = h("div", { class: "charts" });
     this.foot = h("p", { class: "plot-foot" });
@@ -96,13 +96,13 @@ export class LivePlot {
     return hour;
   }
 
-  /** What is new in the station's memory, for every channel that is shown. */
+  /** Fetch new history for every shown channel. */
   ask() {
     if (document.hidden || state.connection !== "live") return;
     this.channels.forEach((channel) => this.hour(channel).refresh());
   }
 
-  /** Look closely at a stretch of time; null goes back to what moves. */
+  /** Zoom into a range of time; null returns to the moving view. */
   async zoom(range) {
     this.range = range;
     this.zoomed.clear();
@@ -164,7 +164,7 @@ export class LivePlot {
     return frame;
   }
 
-  /** A stretch was dragged over: it is looked at closely. */
+  /** Zoom into the range that was selected by dragging. */
   selected(chart) {
     const { left, width } = chart.select;
     if (width < 8) return;
@@ -194,7 +194,7 @@ export class LivePlot {
     this.told();
   }
 
-  /** Lines are painted after the drawing, which the next frame waits for: that counts as well. */
+  /** Painting lines comes after drawing and delays the next frame, so it counts too. */
   painted(time) {
     if (this.began) this.next = Math.max(this.next, this.began + (time - this.began - PAINT) / SHARE);
     this.began = 0;
@@ -204,7 +204,7 @@ export class LivePlot {
     const left = this.range?.[0] ?? right - this.window;
     const columns = Math.max(50, Math.min(900, Math.floor(frame.chart.bbox.width / devicePixelRatio) || 300));
     const width = (right - left) / columns;
-    // Bins stand still in time: their edges are multiples of their width, so that curves glide and do not shimmer.
+    // The edges of bins are multiples of their width, so that curves glide and do not flicker.
     const from = Math.floor(left / width) * width;
     const times = Array.from({ length: 3 * columns }, (_, index) => from + (index * width) / 3);
     const courses = frame.channels.map((channel) => {
@@ -252,7 +252,7 @@ export class LivePlot {
     changed("plot");
   }
 
-  /** Show so many seconds, up to now. */
+  /** Show this many seconds, up to now. */
   span(seconds) {
     this.window = seconds;
     if (this.range) this.zoom(null);
@@ -302,7 +302,7 @@ function options(channels, colours) {
   };
 }
 
-/** Seconds in which samples were lost or not valid, as marks along the lower edge. */
+/** Marks along the lower edge for seconds with lost or invalid samples. */
 function marks(chart, channels, colours) {
   const { left, top, width, height } = chart.bbox;
   const size = 5 * devicePixelRatio;
@@ -317,7 +317,7 @@ function marks(chart, channels, colours) {
   }
 }
 
-/** What a curve says at a column: a value, or from the least to the greatest. */
+/** The text for a curve at a column: a value, or least to greatest. */
 function there(course, place, channel) {
   const [low, high] = [course[3 * place], course[3 * place + 1]].sort((one, other) => one - other);
   if (typeof low !== "number") return low === null ? "not valid" : "nothing";
@@ -334,14 +334,14 @@ function exact(time, width) {
 const hours = (time) => (time === null ? "" : new Date(time * 1000).toTimeString().slice(0, 8));
 const tick = (value) => (value === null ? "" : String(Number(value.toPrecision(6))).replace("-", "\u2212"));
 
-/** A little room above and below; a course that stands still gets a frame too. */
+/** Some room above and below; a constant curve gets a frame too. */
 function padded(_, low, high) {
   if (low === null || low === undefined || high === null) return [0, 1];
   const room = high > low ? (high - low) * 0.08 : Math.abs(high) * 0.05 || 1;
   return [low - room, high + room];
 }
 
-/** A curve that stands: `points` [[x, y] …]. Returns an element; it draws itself when it is in the page. */
+/** A static curve: `points` [[x, y] …]. Returns an element, which draws itself once it is in the page. */
 export function curvePlot(label, xUnit, yUnit, points) {
   const canvas = h("div", { class: "canvas", role: "img", "aria-label": label });
   const sizes = new ResizeObserver(() => {

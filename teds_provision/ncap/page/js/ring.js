@@ -2,9 +2,10 @@
 
 const POINTS = 12000; // two minutes at the 100 points a second that the station sends at most
 
-const TRAVEL = 60; // times its own height that a curve may go up and down and still have a dash
+const TRAVEL = 60; // a curve that goes up and down by so many times its own height shows no dashes
 
-/** Whether a curve goes up and down so often that no dash is seen on it; to paint one there takes many times as long. */
+/** True if dashes would not be visible, since the curve goes up and down so often; painting them takes many times as
+ * long. */
 export function restless(course) {
   let [low, high, before, travel] = [Infinity, -Infinity, null, 0];
   for (const value of course) {
@@ -17,7 +18,7 @@ export function restless(course) {
   return travel > TRAVEL * Math.max(0, high - low);
 }
 
-/** Times (unix s) and values; NaN where there was none. */
+/** Times (unix s) and values; NaN if there was none. */
 export class Ring {
   constructor(size = POINTS) {
     this.size = size;
@@ -29,7 +30,7 @@ export class Ring {
   }
 
   push(time, value) {
-    if (this.held && time < this.newest) this.clear(); // measured anew, by another clock
+    if (this.held && time < this.newest) this.clear(); // the clock went back: start again
     this.time[this.next] = time;
     this.value[this.next] = value;
     this.next = (this.next + 1) % this.size;
@@ -41,7 +42,7 @@ export class Ring {
     this.next = this.held = 0;
   }
 
-  /** Put points [[time, value] …] before those that are held: what was measured before this page was opened. */
+  /** Put points [[time, value] …] before the stored ones: values measured before this page was opened. */
   before(points) {
     const start = (this.next + this.size - this.held) % this.size;
     const held = Array.from({ length: this.held }, (_, step) => {
@@ -59,21 +60,19 @@ export class Ring {
     return this.held ? this.time[(this.next + this.size - 1) % this.size] : NaN;
   }
 
-  /**
-   * Lowest and highest of each of `columns` equal bins from `from` to `to`, in the order in which they came, and a third
-   * entry that is null where the line ends there. A bin without a point is undefined. The line ends before a silence longer
-   * than `silence` seconds, and where there is no value: none was valid, or an angle went on at the other end of its turn.
-   * Of a bin in which it ends, the piece that goes farthest is drawn.
-   */
+  /** Lowest and highest of each of `columns` equal bins from `from` to `to`, in order of time, and a third entry that
+   * is null if the line ends there. A bin without a point is undefined. The line ends before a gap longer than
+   * `silence` seconds, and if there is no value: none was valid, or an angle continued at the other end of its turn. If
+   * it ends within a bin, the longest piece there is drawn. */
   bins(from, to, columns, silence) {
     const out = new Array(3 * columns).fill(undefined);
     const width = (to - from) / columns;
     const start = (this.next + this.size - this.held) % this.size;
     let before = NaN;
     let column = -1;
-    let pieces = []; // of this bin, as lines can be drawn through its points
+    let pieces = []; // of this bin: pieces of the line without a gap
     let piece = null;
-    let ended = false; // whether the line has ended in this bin
+    let ended = false; // true if the line has ended in this bin
     const settle = () => {
       if (column < 0) return;
       const at = 3 * column;

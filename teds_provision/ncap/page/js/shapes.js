@@ -1,17 +1,16 @@
-// From the API's answers to what the views show: numbers in the unit for people, times in unix seconds.
-//
-// The station speaks SI; `shown` of a channel says the unit for people: number = SI × factor + offset.
+// Converts the API's answers for the views: numbers to display units, times to unix seconds. The API uses SI units; a
+// channel's `shown` has the display unit: number = SI × factor + offset.
 
 const KINDS = { sensor: "sensor", actuator: "actuator", "event sensor": "event", event: "event" };
 
-/** Unix seconds of a number or an ISO 8601 text; null where there is neither. */
+/** Unix seconds of a number or an ISO 8601 text; null for others. */
 export function moment(time) {
   if (typeof time === "number") return time;
   const parsed = time ? Date.parse(time) / 1000 : NaN;
   return Number.isFinite(parsed) ? parsed : null;
 }
 
-/** How a channel's SI numbers become those that people read. */
+/** The conversion from a channel's SI numbers to its display unit. */
 export function scaleOf(wire) {
   const shown = wire.shown ?? {};
   const factor = typeof shown.factor === "number" && shown.factor !== 0 ? shown.factor : 1;
@@ -22,7 +21,7 @@ export const toShown = (scale, value) => (typeof value === "number" ? value * sc
 export const fromUnit = (scale, value, unit) => (unit && unit === scale.unit ? value : toShown(scale, value));
 export const toSi = (scale, value) => (value - scale.offset) / scale.factor;
 
-/** Where an angle sensor's turn begins and how long it is, as shown; null for every other channel. */
+/** Start and length of an angle sensor's turn, in its display unit; null for other channels. */
 function turnOf(wire, scale) {
   const whole = 2 * Math.PI;
   if (wire.unit !== "rad" || KINDS[wire.kind] === "actuator" || !(Math.abs(wire.high - wire.low - whole) < 1e-5)) return null;
@@ -54,7 +53,7 @@ const CHARGE = { full: "full", charging: "charging", "in field": "charging", "ch
 function power(wire) {
   if (!wire) return null;
   const flags = wire.flags ?? [];
-  if ("level" in wire && !flags.includes("battery")) return null; // it has none, so there is nothing to tell
+  if ("level" in wire && !flags.includes("battery")) return null; // it has no battery
   return {
     percent: wire.level ?? wire.percent ?? wire.battery_percent ?? null,
     charging: wire.charging ?? flags.map((flag) => CHARGE[flag]).find(Boolean) ?? null,
@@ -62,12 +61,12 @@ function power(wire) {
   };
 }
 
-/** What a measurement does with a node: it measures only while the node runs. */
+/** What a node's state in a measurement means. */
 function modeOf(state) {
   return { running: "measuring", refused: "refused, not measured", lost: "lost, not measured", ended: "not measured" }[state] ?? "waiting to be measured";
 }
 
-/** A node; its verdict is judged from the station's one row of reading, `heard` is what it said in no session. */
+/** A node. Its verdict comes from the station's stored reading; `heard` is what it sent outside a session. */
 export function node(wire) {
   return {
     ...wire,
@@ -104,7 +103,7 @@ export function status(wire) {
   return { ...wire, now: moment(wire.time), started: moment(wire.started), links, vaultProblem };
 }
 
-/** One message of /live as an event with a name. */
+/** A message of /live as an event with a name. */
 export function live(message) {
   if (message.type === "event") return message;
   if (message.type === "values") return { event: "values", channels: message.channels, raw: message.raw ?? {} };

@@ -1,11 +1,11 @@
-// What the page knows, in one place. Views listen to topics; several changes in one frame are told once.
+// The state of the page, in one place. Views listen to topics; several changes in one frame notify them once.
 
 import { get, paths } from "./api.js";
 import { toast } from "./dom.js";
 import { Ring } from "./ring.js";
 import * as shapes from "./shapes.js";
 
-const RINGS = 400; // channels whose course is kept at once
+const RINGS = 400; // channels with stored points
 
 export const state = {
   connection: "connecting", // connecting, live, lost, signed out
@@ -14,19 +14,19 @@ export const state = {
   status: null,
   loaded: false,
   nodes: new Map(), // by UUID; the first thousand
-  total: 0, // how many the station knows
+  total: 0, // number of nodes known to the station
   groups: [],
   measurements: [],
   virtual: [],
   updates: [], // of firmware, the newest first
   profiles: [],
   names: [],
-  values: new Map(), // "uuid/channel" → {value, time, period}; SI, for its datasheet may come later than its values
+  values: new Map(), // "uuid/channel" → {value, time, period}; in SI, because its datasheet may arrive later
   rings: new Map(), // "uuid/channel" → Ring, SI
-  runs: new Map(), // UUID → what provisioning said so far
+  runs: new Map(), // UUID → progress of its provisioning
   tapped: null, // {uuid, at}
-  offset: 0, // station's clock less this one's, s
-  dropped: 0, // points that this page was too slow for, told by the station
+  offset: 0, // station's clock minus this one's, s
+  dropped: 0, // points that the station dropped because this page was too slow
   received: 0,
 };
 
@@ -34,7 +34,7 @@ const listeners = new Map();
 const waiting = new Set();
 let planned = false;
 
-/** Call `listener` after changes of any of these topics; returns what ends it. */
+/** Call `listener` after changes of any of these topics; returns a function that ends this. */
 export function on(topics, listener) {
   for (const topic of topics.split(" ")) {
     if (!listeners.has(topic)) listeners.set(topic, new Set());
@@ -43,7 +43,7 @@ export function on(topics, listener) {
   return () => topics.split(" ").forEach((topic) => listeners.get(topic)?.delete(listener));
 }
 
-/** Say that something changed; views hear of it in the next frame. */
+/** Announce changes; views are notified in the next frame. */
 export function changed(...topics) {
   topics.forEach((topic) => waiting.add(topic));
   if (planned) return;
@@ -54,7 +54,7 @@ export function changed(...topics) {
     waiting.clear();
     heard.forEach((listener) => listener());
   };
-  // A hidden page paints no frames, but what it shows shall be true when it is looked at.
+  // A hidden page gets no frames, but must be up to date when it is shown.
   if (document.hidden) setTimeout(tell, 200);
   else requestAnimationFrame(tell);
 }
@@ -64,7 +64,7 @@ export const now = () => Date.now() / 1000 + state.offset;
 
 export const keyOf = (uuid, channel) => `${uuid}/${channel}`;
 
-/** The last value of a channel, in the unit for people: what was streamed, or what the station told with the node. */
+/** The last value of a channel in its display unit: streamed, or from the node's description. */
 export function lastOf(uuid, channel) {
   const streamed = streamedOf(uuid, channel.number);
   const told = channel.last ?? null;
@@ -72,13 +72,13 @@ export function lastOf(uuid, channel) {
   return told;
 }
 
-/** The last value of a channel that was streamed, in the unit for people. */
+/** The last streamed value of a channel, in its display unit. */
 export function streamedOf(uuid, number) {
   const streamed = state.values.get(keyOf(uuid, number));
   return streamed && { ...streamed, value: shapes.toShown(scaleOf(uuid, number), streamed.value) };
 }
 
-/** Whether a value is too old to be taken for the present one. */
+/** True if a value is too old to count as the present one. */
 export function isStale(last) {
   return !last || state.connection !== "live" || now() - last.time > Math.max(2, 3 * (last.period ?? 0));
 }
@@ -94,12 +94,12 @@ export function ringOf(uuid, channel) {
   return ring;
 }
 
-/** The measurement that has this node, if any: it runs, waits or has failed. */
+/** The measurement that has this node, if any: running, waiting or failed. */
 export function measuring(uuid) {
   return state.measurements.find((one) => one.state !== "ended" && membersOf(one).includes(uuid)) ?? null;
 }
 
-/** Why the measurement that has this node keeps others from changing it; empty if nothing does. */
+/** Why this node's measurement prevents changes; empty if it does not. */
 export function frozenBy(uuid) {
   const one = measuring(uuid);
   if (!one || one.state === "failed") return "";
@@ -116,8 +116,8 @@ export function membersOf(measurement) {
   return state.groups.find((group) => group.name === measurement.group)?.uuids ?? [];
 }
 
-let listed = 0; // requests for measurements, as a list or with the status; an earlier one's answer replaces no later one's
-let newest = 0; // the latest of them that was answered
+let listed = 0; // requests for measurements, as a list or with the status; an older answer must not replace a newer one
+let newest = 0; // number of the latest answered request
 
 function takeMeasurements(measurements, request) {
   if (request < newest) return;
@@ -126,8 +126,8 @@ function takeMeasurements(measurements, request) {
   changed("measurements");
 }
 
-let asked = 0; // requests for nodes, all of them or one; an answer to an earlier one replaces none to a later
-const single = new Map(); // UUID → the last request for that node alone which was answered
+let asked = 0; // requests for nodes, all or one; an older answer must not replace a newer one
+const single = new Map(); // UUID → the last answered request for that node alone
 
 const LISTS = {
   status: async () => {
@@ -161,7 +161,7 @@ const LISTS = {
   names: async () => (state.names = (await get("names")).names ?? []),
 };
 
-/** Forget the course of channels that had another SI unit until now: the curve would be drawn in the new one. */
+/** Drop stored points of channels whose SI unit has changed: the curve would be drawn in the new unit. */
 function forgetOtherUnits(node) {
   for (const channel of node.channels ?? []) {
     const before = state.nodes.get(node.uuid)?.channels?.find((one) => one.number === channel.number);
@@ -169,9 +169,9 @@ function forgetOtherUnits(node) {
   }
 }
 
-const asking = new Map(); // list → whether it is to be asked once more after this answer
+const asking = new Map(); // list → true if it must be fetched again after the present answer
 
-/** Fetch a list anew. Asked twice while an answer is on its way, it is fetched once more after it. */
+/** Fetch lists. A request during another one causes one more fetch after it. */
 export async function refresh(...lists) {
   await Promise.all(lists.map(fetchOne));
 }
@@ -193,9 +193,9 @@ async function fetchOne(list) {
   if (again) await fetchOne(list);
 }
 
-const due = new Set(); // UUIDs of nodes that changed
+const due = new Set(); // UUIDs of changed nodes
 
-/** Fetch one node anew, soon: events come in flocks. */
+/** Fetch one node again, soon: events come in bursts. */
 function refreshNode(uuid) {
   if (!due.size) setTimeout(fetchDue, 60);
   due.add(uuid);
@@ -222,7 +222,7 @@ async function fetchDue() {
   return changed("nodes");
 }
 
-/** What hangs on a list that an event names. */
+/** The lists that depend on an event's subject. */
 const AFTER = {
   measurement: ["measurements", "nodes", "status"],
   group: ["groups", "nodes"],
@@ -235,7 +235,7 @@ const AFTER = {
   log: [],
 };
 
-/** Take one message of the WebSocket. */
+/** Handle a message of the WebSocket. */
 export function take(message) {
   const event = shapes.live(message);
   const taker = TAKERS[event.event];
@@ -259,7 +259,7 @@ const TAKERS = {
   node: (event) => {
     refreshNode(event.uuid);
     if (["running", "lost", "refused", "waiting", "ended", "idle"].includes(event.state)) refresh("status");
-    // Whoever lays a node on the reader wants to see that very node: no button is needed.
+    // Open the tapped node at once: no click is needed.
     if (event.state === "tapped") {
       state.tapped = { uuid: event.uuid, at: performance.now() };
       changed("tap");
@@ -267,7 +267,7 @@ const TAKERS = {
   },
   provision: (event) => {
     if (!state.runs.has(event.uuid) && state.runs.get("next")?.state === "waiting" && event.state === "running") {
-      state.runs.set(event.uuid, state.runs.get("next")); // the node for which "the next one" was asked has come
+      state.runs.set(event.uuid, state.runs.get("next")); // the run for "the next node" now has a UUID
       state.runs.delete("next");
     }
     const run = state.runs.get(event.uuid) ?? { steps: [] };
@@ -297,7 +297,8 @@ const TAKERS = {
 function takeStream(key, times, values, raw = false) {
   const [uuid, channel] = key.split("/");
   const ring = ringOf(uuid, channel);
-  if (raw !== (state.values.get(key)?.isRaw ?? raw)) ring.clear(); // calibrated meanwhile: other numbers
+  // it was calibrated meanwhile: the numbers have another meaning
+  if (raw !== (state.values.get(key)?.isRaw ?? raw)) ring.clear();
   for (let index = 0; index < times.length; index++) ring.push(times[index], values[index] ?? NaN);
   state.received += times.length;
   if (!times.length) return;

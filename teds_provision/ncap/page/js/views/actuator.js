@@ -1,4 +1,4 @@
-// An actuator: moves only while a button is held, and is told to be safe the moment it is let go.
+// An actuator: it moves only while a button is held, and goes to its safe state at release.
 
 import { change, paths } from "../api.js";
 import { chip, field, fill, h, icon, say, text, trouble } from "../dom.js";
@@ -6,8 +6,8 @@ import { channelName, clock, nameOf, range, reading, short } from "../format.js"
 import { toShown, toSi } from "../shapes.js";
 import { now, on, state } from "../state.js";
 
-const HOLD = 0.8; // s: the station lets go by itself when it hears nothing for so long
-const AGAIN = 250; // ms between two words to the station while the button is held
+const HOLD = 0.8; // s: without a request for so long, the station releases the actuator
+const AGAIN = 250; // ms between two requests while the button is held
 
 export class ActuatorPanel {
   constructor(uuid, number_) {
@@ -103,7 +103,7 @@ export class ActuatorPanel {
     this.feed();
   }
 
-  /** One word after the other, never two at once: what the station hears last is what was meant last. */
+  /** Send requests one after the other, never two at once: the last one received is the latest. */
   async feed() {
     if (this.sending) return;
     this.sending = true;
@@ -127,7 +127,7 @@ export class ActuatorPanel {
     await this.safe(refused);
   }
 
-  /** Wait, but no longer than the button is held. */
+  /** Wait, but only while the button is held. */
   pause(milliseconds) {
     return new Promise((go) => {
       this.wake = go;
@@ -138,7 +138,7 @@ export class ActuatorPanel {
   release(leaving = false) {
     if (!this.holding || (leaving && document.visibilityState === "visible" && document.hasFocus())) return;
     this.letGo();
-    if (leaving === true) this.word(true).catch(() => {}); // the page may be gone before the loop comes round
+    if (leaving === true) this.word(true).catch(() => {}); // the page may close before the loop runs again
   }
 
   letGo() {

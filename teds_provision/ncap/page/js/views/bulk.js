@@ -1,14 +1,14 @@
-// The same act on many nodes: one that is refused stops no other, and is named with its reason.
+// One action for many nodes: a refusal does not stop the others, and is listed with its reason.
 
 import { change, get, paths, post } from "../api.js";
 import { button, fill, h, say, text } from "../dom.js";
 import { count, nameOf } from "../format.js";
 import { refresh, state } from "../state.js";
 
-const AT_ONCE = 4; // nodes that are asked side by side
+const AT_ONCE = 4; // nodes worked on at once
 
 export class Bulk {
-  /** `shown` gives the nodes that the list shows, `changed` is called after a choice. */
+  /** `shown` returns the nodes in the list; `changed` is called when the selection changes. */
   constructor(shown, changed) {
     this.chosen = new Set();
     this.shown = shown;
@@ -51,7 +51,7 @@ export class Bulk {
     this.changed();
   }
 
-  /** A node that the station does not know any more is chosen no longer; one that a filter hides is. */
+  /** Deselect nodes that the station no longer knows; nodes hidden by a filter remain selected. */
   paint() {
     for (const uuid of this.chosen) if (!state.nodes.has(uuid)) this.chosen.delete(uuid);
     const hidden = this.chosen.size - this.shown().filter((node) => this.chosen.has(node.uuid)).length;
@@ -65,7 +65,7 @@ export class Bulk {
     this.known.told = names.join("\n");
   }
 
-  /** Do `work` with each chosen node; tells how many are done, and who was refused and why. */
+  /** Do `work` for each selected node; then report how many are done, and each refusal with its reason. */
   async each(verb, work) {
     const waiting = [...this.chosen];
     const [total, refused] = [waiting.length, []];
@@ -113,7 +113,7 @@ export class Bulk {
     return this.whole(() => post("measurements", { uuids }), `Measuring ${count(uuids.length, "node")}.`, "measurements");
   }
 
-  /** What is done with all of them or none. */
+  /** An action for all of them at once. */
   async whole(work, words, list) {
     try {
       await work();

@@ -31,7 +31,7 @@ export class DatasheetTab {
     if (this.read.getAttribute("aria-busy") !== "true") this.read.disabled = state.connection !== "live";
     this.write.paint();
     const judged = state.nodes.get(this.uuid)?.verdict;
-    // The verdict shown here is that of the last reading: it does not stay beside another one in the head of the node.
+    // If the verdict of this reading differs from the node's present one, load the datasheet again.
     if (this.judged !== undefined && judged !== undefined && judged !== this.judged && state.connection === "live") this.load();
   }
 
@@ -71,7 +71,7 @@ export class DatasheetTab {
     );
   }
 
-  /** The board brought this datasheet itself: a yes signs it; where something is wrong with it, with a reason. */
+  /** A factory datasheet: a click signs it; with findings, a reason is needed. */
   brought(findings) {
     const wrong = findings.some((one) => one.severity === "error");
     const reason = h("input", { type: "text", maxlength: "500", autocomplete: "off" });
@@ -121,7 +121,7 @@ function findingLine(finding) {
 }
 
 function figure(curve) {
-  const drawn = curve.points.filter(([, y]) => y !== null); // null: where an angle goes on at the other end of its turn
+  const drawn = curve.points.filter(([, y]) => y !== null); // null: the gap at the end of an angle's turn
   const [first, last] = [drawn[0], drawn.at(-1)];
   const words = `Calibration of ${curve.name}: from ${first?.join(" to ")} up to ${last?.join(" to ")}`;
   return h("figure", {}, h("figcaption", {}, `Calibration of ${curve.name}`), curvePlot(words, curve.x_unit, curve.y_unit, curve.points));

@@ -8,10 +8,10 @@ const LINKS = { nfc: "NFC", can: "CAN", ble: "BLE", virtual: "Virtual" };
 
 const RESULTS = { passed: ["good", "good", "passed"], failed: ["bad", "bad", "failed"], skipped: ["plain", "ask", "skipped"] };
 
-/** What a link is called. */
+/** Display name of a link. */
 export const linkName = (link) => LINKS[link] ?? link ?? "no link";
 
-/** Link, state, battery, in words with signs. */
+/** Link, state and battery as words with icons. */
 export function facts(node) {
   const out = [h("span", {}, icon(node.virtual ? "virtual" : (node.link ?? "ask")), node.virtual ? "Virtual" : linkName(node.link))];
   if (node.present === false) out.push(h("span", { class: "warn" }, icon("clock"), node.seen ? `away, seen ${age(now() - node.seen)}` : "away"));
@@ -29,7 +29,7 @@ export function facts(node) {
 
 const FIRMWARE = { bad: "ruled out by its type", other: "not of its type", outdated: "outdated", "on-trial": "on trial", pending: "another starts at the next restart" };
 
-/** Firmware and what its type thinks of it, in words; hostile text as everything that a node says. */
+/** Firmware, and if it meets the demands of its type. Treated as hostile text, like everything that a node sends. */
 function firmware(told) {
   const build = told.build ? `+${told.build}` : "";
   const name = told.version === null ? "firmware not reported" : `${told.text} ${told.version}${build}`.trim();
@@ -39,7 +39,7 @@ function firmware(told) {
   return h("span", { class: warn ? "firmware warn" : "firmware", title }, icon(warn ? "warn" : "list"), words.filter(Boolean).join(", "));
 }
 
-/** Battery and charging in words. */
+/** Battery and charging as text. */
 function power(told) {
   const level = typeof told.percent === "number" ? `${told.percent} %` : "level unknown";
   const words = { charging: "charging", wanted: "needs charging", full: "full", error: "charging error" }[told.charging];
@@ -47,7 +47,7 @@ function power(told) {
   return h("span", { class: low ? "warn" : "" }, icon(told.charging === "charging" ? "charge" : "battery"), [level, words, low ? "low" : null].filter(Boolean).join(", "));
 }
 
-/** One check of the security check, with its reason. */
+/** One line of the security check, with its reason. */
 export function checkLine(check) {
   if (check.print) return h("li", {}, h("span", { class: "check-name" }, "Key fingerprint"), h("code", { class: "print" }, grouped(check.print)));
   const [tone, sign, words] = RESULTS[check.result] ?? RESULTS.skipped;

@@ -1,4 +1,4 @@
-// A virtual transducer whose source is a simulation: who feeds it, how a program does, and sliders to do it from here.
+// A virtual transducer fed by a simulation: the program that feeds it, its state, and sliders to feed it from here.
 
 import { sourceAddress } from "../api.js";
 import { button, chip, field, fill, h, keyed, say, text, trouble } from "../dom.js";
@@ -11,9 +11,9 @@ export class Feed {
   constructor(uuid) {
     this.uuid = uuid;
     this.socket = null;
-    this.ready = false; // the station has taken the connection
+    this.ready = false; // the station has accepted the connection
     this.values = {}; // by channel name; null: no value
-    this.sent = 0; // when the last line went
+    this.sent = 0; // when the last line was sent
     this.planned = null;
     this.who = h("p", { class: "feed-state", role: "status" });
     this.go = button("Set values here", { onclick: () => (this.socket ? this.stop() : this.start()) }, "play");
@@ -135,7 +135,7 @@ export class Feed {
     fill(this.error, trouble({ message: words, hint: "Press Set values here to try again." }));
   }
 
-  /** Called after it began or ended; the view paints it. */
+  /** Called at the beginning and the end; the view overrides it. */
   changed() {}
 
   end() {

@@ -1,4 +1,4 @@
-// Which of the nodes are listed: by text, type, verdict, calibration, link, group.
+// Filters of the node list: text, type, verdict, calibration, link, group.
 
 import { fill, h, text } from "../dom.js";
 import { nameOf } from "../format.js";
@@ -7,7 +7,7 @@ import { linkName } from "./facts.js";
 
 const SOON = 30 * 86400; // s before a calibration ends
 
-/** Name, words for all, and what a node says of itself there (a word, or several). */
+/** Name, text for "all", and a node's value (a word, or several). */
 const CHOICES = [
   ["type", "Any type", (node) => node.profile ?? "no type"],
   ["verdict", "Any verdict", (node) => node.verdict ?? "not checked"],
@@ -23,7 +23,7 @@ function dueOf(node) {
 }
 
 export class Filters {
-  /** `changed` is called when a person chose something else. */
+  /** `changed` is called when the user changes a filter. */
   constructor(changed) {
     this.search = h("input", { type: "search", placeholder: "Name, UUID or type", "aria-label": "Search nodes", oninput: changed });
     this.selects = CHOICES.map(([name, all]) => h("select", { "aria-label": all.replace("Any ", "Filter by "), "data-filter": name, onchange: changed }, h("option", { value: "" }, all)));
@@ -42,7 +42,7 @@ export class Filters {
     changed();
   }
 
-  /** The nodes that are meant. What may be chosen follows what is there; a choice that nobody fits any more stays. */
+  /** Return the matching nodes. Choices follow the nodes; a chosen one stays even if no node matches it any more. */
   of(nodes) {
     CHOICES.forEach(([, all, of], at) => {
       const select = this.selects[at];

@@ -1,4 +1,4 @@
-// What a node went through at this station: verdicts, sessions, writes, refusals; from the audit log.
+// The history of a node at this station: verdicts, sessions, writes, refusals; from the audit log.
 
 import { get } from "../api.js";
 import { button, chip, empty, fill, h, trouble } from "../dom.js";
@@ -20,7 +20,7 @@ export class HistoryTab {
     this.load();
   }
 
-  /** Events come in flocks. */
+  /** Events come in bursts. */
   soon() {
     this.waiting ??= setTimeout(() => {
       this.waiting = null;

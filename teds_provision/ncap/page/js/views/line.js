@@ -1,4 +1,4 @@
-// The jobs of the line: how far each is, and, opened, how each station does: yield, seconds of each step, failures.
+// The jobs of the line with their progress; an open one shows each station: yield, seconds per step, failures.
 
 import { get } from "../api.js";
 import { chip, fill, h, keyed, text } from "../dom.js";
@@ -7,7 +7,7 @@ import { on, state } from "../state.js";
 
 const EVERY = 10000; // ms
 
-/** The panel, hidden where no job was taken; `end` stops asking. */
+/** The panel, hidden if there is no job; `end` stops polling. */
 export function linePanel() {
   const list = h("ul", { class: "lines jobs" });
   const panel = h("section", { class: "panel wide", "aria-label": "Line", hidden: true }, h("h3", {}, "Line"), list);
@@ -18,7 +18,7 @@ export function linePanel() {
     try {
       jobs = state.status?.plant ? (await get("jobs")).jobs : [];
     } catch {
-      return; // the connection's own line says so
+      return; // the connection line reports this
     }
     panel.hidden = !jobs.length;
     keyed(list, jobs.toReversed(), (one) => one.id, (one) => jobRow(one, open, askOne), (element, one) => element.paint(one));
@@ -29,7 +29,7 @@ export function linePanel() {
     try {
       list.querySelector(`[data-job="${id}"]`)?.show(await get(`jobs/${id}`));
     } catch {
-      // asked again soon
+      // polled again soon
     }
   }
 
@@ -101,6 +101,7 @@ function bars(title, rows) {
 
 function length(tone, share) {
   const one = h("i", { class: tone });
-  one.style.width = `${(100 * Math.min(1, Math.max(0, share))).toFixed(1)}%`; // the page's policy allows no style in markup
+  // the page's content security policy forbids style in markup
+  one.style.width = `${(100 * Math.min(1, Math.max(0, share))).toFixed(1)}%`;
   return one;
 }

@@ -1,9 +1,9 @@
-// A station without a link to boards: that it finds none, and how to add one.
+// A station without links: reports that it finds no boards, and how to add a link.
 
 import { h } from "../dom.js";
 import { state } from "../state.js";
 
-/** True if no link to boards is configured; the bus of virtual transducers reaches none. */
+/** True if no link to boards is configured; the bus of virtual transducers does not count. */
 export const isLinkless = () => state.status !== null && !state.status.links.some((link) => !link.virtual);
 
 /** How to add a link; hidden at first. */

@@ -1,14 +1,14 @@
-// The audit log: what was done, by whom, what was refused, and whether its chain is intact. The station searches it.
+// The audit log: actions, actors, refusals, and whether its chain is intact. The station does the searching.
 
 import { get } from "../api.js";
 import { button, chip, empty, fill, h, keyed, text, trouble } from "../dom.js";
 import { clock, count, nameOf } from "../format.js";
 import { now, on, state } from "../state.js";
 
-const EVERY = 5000; // ms between two looks for what is new
+const EVERY = 5000; // ms between two requests for new entries
 const PAGE = 200; // entries in one answer
 const TIMES = [["All entries", 0], ["Last hour", 3600], ["Last day", 86400], ["Last 7 days", 604800]]; // s
-const TYPING = 250; // ms after the last key before the station is asked
+const TYPING = 250; // ms after the last key stroke before the search is sent
 
 export function logView(main) {
   const search = h("input", { type: "search", placeholder: "Action, node or text", "aria-label": "Search the log", maxlength: "200" });
@@ -22,13 +22,13 @@ export function logView(main) {
   const older = button("Show older entries", { onclick: () => older.busy(() => load(Math.min(...entries.keys()))) });
   main.append(h("div", { class: "panel-head view-head" }, h("h2", {}, "Log"), intact, search, since, h("label", { class: "tick" }, failed, h("span", {}, "Failures only")), total), h("section", { class: "panel", "aria-label": "Audit log" }, none, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Audit log" }, table), h("div", { class: "row" }, older)));
 
-  let entries = new Map(); // by sequence number: what was fetched under this search
-  let asked = null; // the search that they belong to
-  let more = false; // whether the station has older ones
-  let told = null; // the newest answer
+  let entries = new Map(); // by sequence number: entries for the present search
+  let asked = null; // the search to which they belong
+  let more = false; // true if the station has older ones
+  let told = null; // the latest answer
   let typing = null;
 
-  /** Fetch the newest entries, or those before a number; an answer to an earlier search counts for nothing. */
+  /** Fetch the newest entries, or those before a number; answers to an earlier search are dropped. */
   async function load(before = null) {
     const words = new URLSearchParams({ limit: PAGE });
     if (search.value.trim()) words.set("text", search.value.trim());

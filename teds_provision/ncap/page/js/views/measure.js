@@ -1,4 +1,4 @@
-// Groups, what is measured, and the moving plot.
+// Groups, measurements, and the moving plot.
 
 import { change, paths, post, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, trouble } from "../dom.js";
@@ -51,7 +51,7 @@ class Groups {
     if (this.all.getAttribute("aria-busy") !== "true") this.all.disabled = !may;
   }
 
-  /** Every authentic node, now and when it comes, until its card here is stopped. */
+  /** Measure every authentic node, present ones and later arrivals, until its card here is stopped. */
   async everything() {
     this.error.replaceChildren();
     try {
@@ -150,7 +150,8 @@ class GroupCard {
     this.errorShown = one?.error?.message;
   }
 
-  /** Nodes to tick, those of the group ticked. What somebody ticked stays, whichever nodes come, until the group changes. */
+  /** Check boxes for nodes, with the group's checked. The user's choice is kept when nodes come, until the group
+   * changes. */
   paintMembers(group, frozen) {
     const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false).sort(byName);
     const told = JSON.stringify([group.uuids, frozen]);
@@ -179,10 +180,10 @@ class GroupCard {
     }, `Group ${this.name} is now measuring.`);
   }
 
-  /** Once more, at the rate that is in the field by now; all else as it was asked for. */
+  /** Start again at the rate now in the field; all other settings as before. */
   async again() {
     const { id, kind, trigger, sinks, actuators, dead_man } = this.measurement;
-    const names = sinks.map((sink) => sink.split("/").at(-1)); // a file is named without its folder
+    const names = sinks.map((sink) => sink.split("/").at(-1)); // show a file's name without its folder
     await this.does(async () => {
       await remove(paths.measurement(id));
       return post("measurements", { group: this.name, rate: Number(this.rate.value), kind, trigger, sinks: names, actuators, dead_man });
@@ -210,7 +211,7 @@ class GroupCard {
   }
 }
 
-/** How the nodes of a measurement fare together: "15 running, 2 lost, 4200 samples, none lost". */
+/** Summary of a measurement's nodes: "15 running, 2 lost, 4200 samples, none lost". */
 function inAll(measurement) {
   const states = new Map();
   for (const node of measurement.nodes ?? []) states.set(node.state, (states.get(node.state) ?? 0) + 1);
@@ -256,7 +257,8 @@ function loneCard(one) {
 /** The moving plot with a choice of channels. */
 class Course {
   constructor() {
-    this.chosen = new Map(); // "uuid/number" → yes or no, as the person said; others follow what is measured
+    // "uuid/number" → the user's choice, true or false; other channels are shown if they are measured
+    this.chosen = new Map();
     this.ticks = h("div", { class: "ticks" });
     this.pick = h("details", { class: "pick" }, h("summary", {}, "Channels"), this.ticks);
     this.plot = new LivePlot([]);

@@ -1,4 +1,4 @@
-// One node: who it is, and its three tabs.
+// One node: its identity, and its three tabs.
 
 import { paths, post } from "../api.js";
 import { button, chip, fill, h, icon, keyed, say, text, trouble } from "../dom.js";

@@ -1,4 +1,4 @@
-// The nodes that are there, and the one that is open.
+// The list of nodes, and the open one.
 
 import { button, chip, empty, fill, h, icon, keyed, text } from "../dom.js";
 import { byName, channelName, count, figure, nameOf, verdict } from "../format.js";
@@ -11,11 +11,11 @@ import { NodePanel } from "./node.js";
 import { ProvisionTab } from "./provision.js";
 import { latest, progressOf, UpdatePanel } from "./update.js";
 
-const MARKED = 8000; // ms that a tapped node stays marked
+const MARKED = 8000; // ms for which a tapped node is marked
 const SHOWN_VALUES = 3;
 const SEARCH_FROM = 7; // nodes
-const NEWS = 3600; // s for which an update that is over is linked from the list
-const DRAWN = 100; // cards that are drawn at once; a press draws as many more
+const NEWS = 3600; // s for which a finished update is linked from the list
+const DRAWN = 100; // cards drawn at once; a button draws as many more
 const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || byName(one, other);
 
 export function nodesView(main, rest) {
@@ -31,13 +31,13 @@ export function nodesView(main, rest) {
   const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), linkless, filters.element, h("div", { class: "row tools-row" }, bulk.toggle), bulk.bar, h("p", { class: "side-news" }, updating), list, more, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
   main.append(side, none, detail);
   let drawn = DRAWN;
-  let listed = []; // the nodes that fit the filters, in their order
+  let listed = []; // the nodes that match the filters, in order
   let panel = null;
-  let next = null; // the form for whichever node is tapped next
-  let firmware = null; // the update of many boards
+  let next = null; // the form for the next tapped node
+  let firmware = null; // the update of several boards
   let chosen = rest;
 
-  let first = null; // UUID of the node on top: open where none is chosen
+  let first = null; // UUID of the first node: shown if none is chosen
 
   function paint() {
     const nodes = (listed = filters.of([...state.nodes.values()]).sort(order));
@@ -64,7 +64,7 @@ export function nodesView(main, rest) {
       fill(none, state.loaded ? firstSteps() : h("p", { class: "empty" }, "Loading …"));
     }
     if (!any && state.loaded) {
-      const unlinked = none.querySelector("[data-linkless]"); // absent while the page of one node is open
+      const unlinked = none.querySelector("[data-linkless]"); // absent while one node's page is open
       if (unlinked) unlinked.hidden = !lacking;
       const hidden = none.querySelector("[data-strangers]");
       if (hidden) hidden.hidden = !strangers;

@@ -1,4 +1,4 @@
-// The provisioning tab: from a type to a signed datasheet, waiting for the tap and followed live.
+// The provisioning tab: from a type to a signed datasheet; waits for the tap and shows progress live.
 
 import { get, paths, post } from "../api.js";
 import { button, chip, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
@@ -52,10 +52,10 @@ export class ProvisionTab {
     this.recall();
   }
 
-  /** What was asked for before this page was opened, here or in another browser. */
+  /** Show a run that was started before this page was opened, here or in another browser. */
   async recall() {
     if (this.run) return;
-    const run = await get(paths.provision(this.uuid)).catch(() => null); // nobody asked: there is nothing to show
+    const run = await get(paths.provision(this.uuid)).catch(() => null); // no run: nothing to show
     if (!run || this.run || !["waiting", "running"].includes(run.state)) return;
     state.runs.set(this.uuid, run);
     this.paint();
@@ -134,7 +134,7 @@ export class ProvisionTab {
         calibration_name: file?.name ?? null,
         calibration_item: this.certified() ? this.item.value.trim() || null : null,
       });
-      // An event may have come before this answer, be it that of the end, and then knows more.
+      // An event, even that of the end, may have arrived before this answer; then it is more recent.
       if (this.run === before) state.runs.set(this.uuid, { steps: [], ...answer, state: answer.state ?? (answer.waits_for ? "waiting" : "running") });
       this.paint();
     } catch (error) {

@@ -1,13 +1,13 @@
-// The rate that the station proposes, before a measurement and while one loses values, as a preset.
+// Offers the rate that the station proposes, before a measurement and while one loses values.
 
 import { get } from "../api.js";
 import { button, h, text } from "../dom.js";
 import { hertz } from "../format.js";
 import { state } from "../state.js";
 
-const EVERY = 30000; // ms between two proposals: the load of the machine changes
+const EVERY = 30000; // ms between two requests: the machine's load changes
 
-/** A line below the field of the rate. `of()` is the query of what is measured, `take(rate)` begins again at a lower one. */
+/** A line below the rate field. `of()`: the query for the measured nodes; `take(rate)` starts again at a lower rate. */
 export class RateHint {
   constructor(entry, of, take) {
     Object.assign(this, { entry, of, take, rate: null, losing: false, asked: -Infinity });
@@ -16,7 +16,7 @@ export class RateHint {
     this.element = h("div", { class: "row rate-hint", hidden: true }, this.words, this.use);
   }
 
-  /** `one`: the measurement that runs, null where none does. */
+  /** `one`: the running measurement, or null. */
   paint(one, may) {
     this.use.disabled = !may || this.use.getAttribute("aria-busy") === "true";
     if (one) return this.running(one);
@@ -35,7 +35,7 @@ export class RateHint {
 
   async ask() {
     this.asked = performance.now();
-    const found = await get(`measurements/rate?${this.of()}`).catch(() => null); // without a proposal there is nothing to show
+    const found = await get(`measurements/rate?${this.of()}`).catch(() => null); // nothing is shown without a proposal
     if (this.losing || !found) return;
     const proposal = found.proposal;
     if (!proposal || proposal.limit === "datasheet") return this.hide();

@@ -1,10 +1,10 @@
-// Whether set points may come by topics of ROS for what is measured, and when an actuator without them is safe.
+// Choose if ROS topics may send set points to the measured nodes, and the dead-man of their actuators.
 
 import { Refusal } from "../api.js";
 import { field, h, text } from "../dom.js";
 import { state } from "../state.js";
 
-const LEAST = 20; // ms, as the node takes it
+const LEAST = 20; // ms, the least that a node accepts
 const MOST = 10000;
 
 export class SetPoints {
@@ -15,7 +15,7 @@ export class SetPoints {
     this.element = h("div", { class: "row", role: "group", "aria-label": "Set points from topics" }, h("label", { class: "tick" }, this.box, h("span", {}, "Allow topics to move actuators")), field("Dead-man, ms", this.deadMan), this.hint);
   }
 
-  /** `one`: the measurement that runs, null where none does; `uuids`: the nodes that it is about. */
+  /** `one`: the running measurement, or null; `uuids`: the nodes concerned. */
   paint(uuids, one) {
     const movable = uuids.some((uuid) => (state.nodes.get(uuid)?.channels ?? []).some((channel) => channel.kind === "actuator"));
     const taken = state.status?.actuators === true;
@@ -26,7 +26,7 @@ export class SetPoints {
     text(this.hint, !taken ? "This station does not accept set points from topics." : one ? (one.actuators ? `Accepted. An actuator goes to its safe state ${one.dead_man} ms after the last one.` : "Not accepted in this measurement.") : "");
   }
 
-  /** What POST /measurements is told; throws where the dead-man is none. */
+  /** Members for POST /measurements; throws if the dead-man is not valid. */
   get asked() {
     const words = this.deadMan.value.trim();
     const deadMan = words === "" ? null : Number(words);

@@ -1,4 +1,4 @@
-// The station itself: links, where values go, clock, budget, published names.
+// The station itself: links, sinks, clock, budget, published names.
 
 import { change, get } from "../api.js";
 import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
@@ -8,7 +8,7 @@ import { linkName } from "./facts.js";
 import { linePanel } from "./line.js";
 import { isLinkless, noLink } from "./links.js";
 
-const NAMES = 40; // rows of published names; a press shows as many more
+const NAMES = 40; // rows of published names; a button shows as many more
 
 export function stationView(main) {
   const links = h("ul", { class: "lines" });
@@ -109,7 +109,7 @@ export function stationView(main) {
     try {
       known = state.status?.plant ? await get("plant") : null;
     } catch {
-      known = null; // it left meanwhile
+      known = null; // the station has left the plant meanwhile
     }
     paintPlant();
   }
@@ -122,7 +122,7 @@ export function stationView(main) {
       fill(holders, h("li", { class: "hint" }, error.message));
       return;
     }
-    if (words !== whose.value.trim()) return; // a later question is under way
+    if (words !== whose.value.trim()) return; // a later request is in progress
     const lines = found.nodes.map((one) => h("li", {}, h("span", { class: "grow" }, h("strong", {}, one.name || short8(one.uuid)), h("span", { class: "hint" }, ` ${one.uuid}: ${heldBy(one.says)}`)), one.says.revoked.length ? chip("bad", "warn", "revoked") : one.conflicts.length ? chip("warn", "warn", one.conflicts[0].name) : null));
     fill(holders, words && !lines.length ? h("li", { class: "hint" }, "No station reports such a node.") : lines, found.more ? h("li", { class: "hint" }, "More nodes match: enter more of the UUID or name.") : null);
   }
@@ -176,7 +176,7 @@ function again(element, facts, make) {
 
 const nodeOf = (one) => state.nodes.get(one.uuid) ?? { uuid: one.uuid };
 
-/** What a published name belongs to. */
+/** The node or channel of a published name. */
 function labelOf(one) {
   const node = nodeOf(one);
   const channel = node.channels?.find((each) => each.number === one.channel);
@@ -203,7 +203,7 @@ function nameRow(one) {
     known = now;
     text(label, labelOf(now));
     entry.setAttribute("aria-label", `Topic of ${label.textContent}`);
-    // What somebody typed stays until it is sent, whatever others rename meanwhile.
+    // Keep the text that the user is typing until it is sent, even if the name changes meanwhile.
     if (document.activeElement !== entry && entry.value === (entry.told ?? "")) entry.value = entry.told = now.topic ?? "";
     keep.disabled = state.status?.write === false || state.connection !== "live";
   };

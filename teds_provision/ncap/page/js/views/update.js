@@ -1,4 +1,4 @@
-// New firmware for the selected boards: an image, the plan, its questions, progress, and how each board ended.
+// New firmware for the selected boards: image, plan, questions, progress, and each board's result.
 
 import { paths, remove, send } from "../api.js";
 import { button, chip, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
@@ -6,7 +6,7 @@ import { clock, count, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
 
 const LARGEST = 4 << 20; // octets that the station takes
-const PATIENCE = 600000; // ms: a plan meets every board
+const PATIENCE = 600000; // ms: planning contacts every board
 const RESULTS = {
   updated: ["good", "good", "updated"],
   already: ["plain", "good", "runs it already"],
@@ -17,7 +17,7 @@ const RESULTS = {
 const STEPS = { upload: "uploading", restart: "restarting", prove: "proving itself", revert: "going back" };
 const PLANS = { upload: "Installs", restart: "Restarts with", prove: "Proves and keeps", nothing: "Runs it already:" };
 
-/** The update that runs, else the newest that is over; null if there was none. */
+/** The running update, or else the latest finished one; null if there was none. */
 export const latest = () => state.updates.find((one) => one.state === "running") ?? state.updates[0] ?? null;
 
 /** "2 of 3 boards done". */
@@ -26,11 +26,11 @@ export const progressOf = (update) => `${update.boards.filter((one) => one.resul
 const called = (uuid) => nameOf(state.nodes.get(uuid) ?? { uuid });
 
 export class UpdatePanel {
-  /** `chosen` gives the UUIDs that are selected in the list, `select` lets a person select some. */
+  /** `chosen` returns the UUIDs selected in the list; `select` lets the user select some. */
   constructor(parent, chosen, select) {
     this.chosen = chosen;
     this.leaving = new AbortController();
-    this.image = null; // {name, octets}: what is planned is what is sent, whatever becomes of the file
+    this.image = null; // {name, octets}: the planned octets are sent, even if the file changes
     this.plan = null;
     this.file = h("input", { type: "file", class: "unseen-input", accept: ".bin,application/octet-stream", id: "firmware-image", onchange: () => this.take(this.file.files[0]) });
     this.fileName = h("strong", {}, "Choose a firmware image");
@@ -119,7 +119,7 @@ export class UpdatePanel {
     }
   }
 
-  /** Boards of the plan that the update is for: those without a question, and those whose question was answered. */
+  /** Boards of the plan to update: those without a question, and those whose question was answered with yes. */
   meant() {
     return (this.plan?.boards ?? []).filter((one) => one.plan && !one.result && (!one.question || this.yes.get(one.uuid).checked)).map((one) => one.uuid);
   }

@@ -1,4 +1,4 @@
-// The live tab: values with units, actuators, measuring on and off, curves.
+// The live tab: values with units, actuators, start and stop of measuring, curves.
 
 import { paths, post, Refusal, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
@@ -9,7 +9,7 @@ import { ActuatorPanel } from "./actuator.js";
 import { RateHint } from "./rates.js";
 import { SetPoints } from "./setpoints.js";
 
-const MOVING = 12; // channels that a node's plot shows
+const MOVING = 12; // most channels in a node's plot
 
 export class LiveTab {
   constructor(parent, uuid) {
@@ -51,7 +51,7 @@ export class LiveTab {
     this.values();
   }
 
-  /** No channels: a stranger is provisioned, a node of ours gets its datasheet read. */
+  /** No channels: offer to provision an unknown node, or to read the datasheet of a known one. */
   nothing(stranger) {
     if (this.none.dataset.stranger === String(stranger) && this.none.firstChild) return;
     this.none.dataset.stranger = String(stranger);
@@ -111,7 +111,7 @@ export class LiveTab {
       element.classList.toggle("stale", stale);
       element.classList.toggle("fresh", !stale);
       if (bar) bar.value = last?.value ?? channel.low;
-      if (bar) bar.hidden = Boolean(channel.problem); // a raw number has no place in the range
+      if (bar) bar.hidden = Boolean(channel.problem); // a raw number cannot be placed in the range
     }
   }
 
@@ -160,7 +160,7 @@ function calibrated(channel) {
   return h("span", { class: "dates" }, h("span", {}, channel.calibrated), channel.due ? [" ", h("span", { class: "hint" }, `due ${channel.due}`)] : null);
 }
 
-/** Title of a plot with its window and a pause. */
+/** Header of a plot: time window and pause. */
 export function plotHead(plot, tag, title = "Plot") {
   const windows = h("div", { class: "switch", role: "group", "aria-label": "Time shown" });
   const show = (seconds) => {
@@ -183,7 +183,7 @@ export function plotHead(plot, tag, title = "Plot") {
   return h("div", { class: "panel-head plot-head" }, h(tag, {}, title), windows, pause, back);
 }
 
-/** Idle or measuring, and how fast. */
+/** Shows if the node is measured, and how fast. */
 class ModePanel {
   constructor(uuid) {
     this.uuid = uuid;
@@ -240,7 +240,7 @@ class ModePanel {
     }
   }
 
-  /** Once more, at the rate that is in the field by now; all else as it was asked for. */
+  /** Start again at the rate now in the field; all other settings as before. */
   async again() {
     const { id, uuids, channels, kind, trigger, sinks, actuators, dead_man } = this.measurement;
     try {
@@ -268,7 +268,7 @@ class ModePanel {
   }
 }
 
-/** Raise where the datasheets say that a sensor is slower: it would only wait for ever. */
+/** Throw if a sensor's datasheet does not permit the rate: the measurement would wait for ever. */
 export function requireRate(uuids, rate) {
   if (rate === null) return;
   if (!(rate > 0)) throw new Refusal(0, "usage", "Enter a rate above 0 Hz.", "Or leave it empty to use the rate in the datasheet.");
@@ -279,7 +279,7 @@ export function requireRate(uuids, rate) {
   }
 }
 
-/** How many values are not valid and why, the most frequent reasons first; those that `why` gives already are left out. */
+/** Invalid values by reason, the most frequent first, without those that `why` already contains. */
 function invalid(node, why) {
   const reasons = [...(node.invalid_why ?? [])].sort((one, other) => other.count - one.count);
   const most = reasons.filter((one) => !why.includes(one.why)).slice(0, 3);
@@ -288,7 +288,7 @@ function invalid(node, why) {
   return `${node.invalid} invalid${words ? ` (${words})` : ""}`;
 }
 
-/** How a node of a measurement fares, in words. */
+/** State of a node in a measurement, as text. */
 export function told(measurement, uuid) {
   const node = measurement.nodes?.find((one) => one.uuid === uuid);
   const word = node?.state ?? measurement.state ?? "starting";

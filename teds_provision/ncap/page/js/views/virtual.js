@@ -66,7 +66,7 @@ export function virtualView(main) {
       say(`Virtual transducer ${made.name ?? ""} created.`);
       const link = h("a", { href: `#/nodes/${made.uuid}` }, nameOf(made));
       fill(error, h("p", { class: "done" }, chip("good", "good", "Created"), " ", link));
-      if (newUuid) link.focus(); // the button that was pressed is gone
+      if (newUuid) link.focus(); // the pressed button no longer exists
       await refresh("virtual", "nodes");
     } catch (refusal) {
       if (refusal.code !== "uuid-known") {
@@ -103,7 +103,7 @@ function card(one, changed) {
   let sure = false;
   drop.addEventListener("click", () => {
     if (!sure) {
-      sure = true; // its key goes with it, so this is asked twice
+      sure = true; // asks twice, because the key is deleted too
       text(drop.lastChild, "Delete this transducer and its key?");
       setTimeout(() => {
         sure = false;

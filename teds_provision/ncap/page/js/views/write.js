@@ -1,4 +1,4 @@
-// Write a datasheet from a file: what would change is shown in physical units, then it is signed and written.
+// Write a datasheet from a file: show the changes in physical units, then sign and write it.
 
 import { change, paths } from "../api.js";
 import { button, chip, field, fill, h, icon, say, trouble } from "../dom.js";
@@ -7,7 +7,7 @@ import { frozenBy, on, state } from "../state.js";
 
 const LARGEST = 900000; // octets: the station takes bodies of at most 1 MiB
 
-/** What changes, in the words of the diff's sentence: "stated uncertainty" rather than OError. */
+/** Name of a change, as in the diff's sentence: "stated uncertainty" rather than OError. */
 function labelOf(one) {
   const end = ` ${one.before} -> ${one.after}.`;
   if (!one.text?.endsWith(end)) return one.field;
@@ -80,14 +80,14 @@ export class WritePanel {
     }
   }
 
-  /** A board of another type than the datasheet's becomes one only where a person says so. */
+  /** A board becomes another type only if the user confirms that. */
   otherType(name, body, error) {
     const again = button("Change its type and compare", {}, "ask");
     again.addEventListener("click", () => this.compare(name, { ...body, retype: true }));
     fill(this.result, trouble({ message: error.message, hint: "Choose the datasheet of this board, or connect the right board." }), h("div", { class: "row" }, again));
   }
 
-  /** A calibration that looks wrong is written only with a reason, which goes into the log. */
+  /** A suspicious calibration is written only with a reason, which is logged. */
   unlikely(name, body, error) {
     const reason = h("input", { type: "text", maxlength: "200", autocomplete: "off" });
     const again = button("Accept and compare again", {}, "ask");
@@ -140,7 +140,7 @@ export class WritePanel {
       this.written();
     } catch (error) {
       if (error.status !== 412) return fill(this.result, trouble(error));
-      await this.compare(name, body); // another client wrote since the changes were shown: nothing unseen is written
+      await this.compare(name, body); // another client wrote meanwhile: show the changes again before writing
       this.result.prepend(trouble({ message: "The datasheet on the node has changed since.", hint: "Review the changes again." }));
     }
   }
