@@ -1315,8 +1315,8 @@ PATTERNS = (
     Pattern(
         "of requests for one tap the first is served first",
         "NodeJobs.serve",
-        "(job for job in self._waiting if job.uuid in (uuid, None))",
-        "(job for job in reversed(self._waiting) if job.uuid in (uuid, None))",
+        "(job for job in self._waiting if job.uuid in (uuid, None) and job.until > now)",
+        "(job for job in reversed(self._waiting) if job.uuid in (uuid, None) and job.until > now)",
         "tests/ncap/test_node_jobs.py",
     ),
     Pattern(

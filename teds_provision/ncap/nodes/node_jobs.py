@@ -154,7 +154,7 @@ class NodeJobs:
                     f"Node {uuid} is on no bus of this station and was not placed on a reader within {wait:.0f} s.",
                     hint="Place it on the reader, or connect it to the bus.",
                 )
-            errand.done.wait()  # it was tapped in time, and what was begun is not given up
+            errand.done.wait()  # the tap came in time, and a job in progress is not cancelled
         if errand.error is not None:
             raise errand.error
         return cast("Result", errand.result)
@@ -203,7 +203,7 @@ class NodeJobs:
         if not node.tapped:
             return False
         uuid, now = node.uuid.hex(), time.monotonic()
-        with self._guard:  # one whose time is over stays for its waiter, which cancels it
+        with self._guard:  # an expired job is left to its waiting thread, which cancels it
             found = next((job for job in self._waiting if job.uuid in (uuid, None) and job.until > now), None)
             if found is not None:
                 self._waiting.remove(found)
