@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import KeyMismatchError
+from teds_provision.errors import KeyMismatchError, StoreChangedError
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station import pins
-from teds_provision.station.store.records import Draft, WhitelistEntry
+from teds_provision.station.store.records import Draft, NodeRecord, WhitelistEntry
 from teds_provision.teds.image import Image
 from tests.bench import make_station
 
@@ -42,3 +42,20 @@ def test_the_draft_of_a_board_that_was_replaced_goes_with_its_pin(tmp_path: Path
             assert (station.datasheets.draft(UUID) is not None) is stays
             assert station.pins.is_unsettled(UUID) is not stays
             station.pins.settled(UUID)
+
+
+def test_a_node_that_showed_another_key_than_its_pin_is_found_among_many(tmp_path: Path) -> None:
+    with closing(make_station(tmp_path / "home")) as station:
+        point, other = SoftwareKey.generate().point, fingerprint(SoftwareKey.generate().point)
+        shown = fingerprint(point)
+        pinned = {1: shown, 2: shown[:32], 3: None, 4: other, 5: other[:32]}
+        for number in range(7):
+            uuid = number.to_bytes(10, "big")
+            station.nodes.put(NodeRecord(uuid, point if number < 6 else None))
+            if number in pinned:
+                station.pins.put(WhitelistEntry(uuid, pinned[number]))
+        nodes = list(station.nodes.all())
+        assert {uuid[-1] for uuid in station.pins.pinned_elsewhere(nodes)} == {4, 5}
+        station._store.execute("UPDATE whitelist SET fingerprint = ? WHERE uuid = ?", (shown, nodes[4].uuid))
+        with pytest.raises(StoreChangedError, match=nodes[4].uuid.hex()):
+            station.pins.pinned_elsewhere(nodes)

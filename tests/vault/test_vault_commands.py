@@ -141,6 +141,10 @@ def test_a_process_that_opened_the_vault_before_goes_on_with_the_new_master_key(
     rewrap(third)
     long_running.keys.add_pending(NODES[1], key=b"made later......", key_id=b"later...", epoch=7)
     assert (7, b"made later......") in keys(opened(home))
+    rewrap(opened(home))
+    named = long_running.keys.unwrap_named({uuid: uuid[-8:].hex() for uuid in NODES})
+    assert named == {uuid: (1, uuid + b"first!") for uuid in NODES}, "an export goes on as well"
+    assert long_running.keys.unwrap_named({NODES[0]: "00" * 8}) == {}
     for station in (long_running, other, third):
         station.close()
 
