@@ -1,0 +1,183 @@
+"""What the service decides at its top, in this process and without links: detection, groups, the vault, the store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import FrozenError, NewerStoreError, NotFoundError, StoreError, UsageError, VaultLockedError
+from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.nodes.link_watch import LinkState
+from teds_provision.ncap.settings import Settings
+from teds_provision.station.store.audit import AuditFilter
+from tests.bench import copied_station
+
+NODE, OTHER = "ab" * 10, "cd" * 10
+
+
+class Watched:
+    """A link that is asked to look at all of its nodes."""
+
+    place = "can:x"
+
+    def __init__(self) -> None:
+        self.looks, self.state = 0, LinkState(self.place)
+
+    def look_at_all(self) -> None:
+        self.looks += 1
+
+
+class Bench:
+    """A daemon that was made and does not run, the events that it sends, and who was selected again how often."""
+
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.station = copied_station(folder)
+        self.daemon = Daemon(self.station, Settings())
+        self.events: list[tuple[str, str | None]] = []
+        self.daemon.live.on_event = lambda event: self.events.append((event["event"], event.get("state")))
+        self.watch, self.selected = Watched(), list[str]()
+        self.daemon.watches = [self.watch]  # type: ignore[list-item]
+        patch.setattr(self.daemon.measuring, "look_who_is_meant", lambda: self.selected.append("again"))
+
+    def outcomes(self, act: str) -> list[str]:
+        return [entry.outcome for entry in self.station.audit_log.chosen(AuditFilter(act=act))]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    made = Bench(tmp_path / "home", monkeypatch)
+    yield made
+    made.daemon.buses.close()
+    made.station.close()
+
+
+def test_a_vault_that_is_open_again_has_all_nodes_selected_and_looked_at_anew(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = [False, True, True, False, False]
+
+    def current_vault() -> None:
+        if closed.pop(0):
+            raise VaultLockedError("Another process has a new master key.", hint="unlock")
+
+    monkeypatch.setattr(bench.station, "current_vault", current_vault)
+    states = []
+    for _ in range(5):
+        bench.daemon._look_at_vault()
+        states.append(bench.daemon.status()["vault"]["state"])
+    assert states == ["open", "locked", "locked", "open", "open"]
+    assert bench.events == [("vault", "locked"), ("vault", "open")]
+    assert (bench.selected, bench.watch.looks) == (["again"], 1)
+
+
+def test_another_mode_of_detection_forgets_the_nodes_that_were_found_in_the_one_before(bench: Bench) -> None:
+    directory = bench.daemon.directory
+    before = bench.daemon.detection
+    for mode in (before, "transparent" if before == "whitelist" else "whitelist"):
+        directory.note(NODE, "came", place="can:x", present=True)
+        bench.daemon.set_detection(mode)
+        assert (bench.daemon.detection, directory.seen(NODE).present) == (mode, mode == before)
+    assert (bench.selected, bench.watch.looks, bench.outcomes("detection")) == (["again"] * 2, 2, ["set", "set"])
+    with pytest.raises(UsageError, match="not a detection mode"):
+        bench.daemon.set_detection("all")
+
+
+def test_a_group_that_is_measured_keeps_its_nodes(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, measured = bench.daemon, list[str]()
+    monkeypatch.setattr(daemon.measuring, "measured_as", lambda _name: measured)
+    daemon.make_group("arm", [NODE])
+    daemon.change_group("arm", [NODE, OTHER])
+    daemon.change_group("arm", [OTHER])
+    assert [(group["name"], group["uuids"], group["measuring"]) for group in daemon.groups()] == [
+        ("arm", [OTHER], False)
+    ]
+    assert (bench.events, bench.selected) == ([("group", "changed")] * 3, ["again"] * 3)
+    measured.append("m1")
+    for change in (lambda: daemon.change_group("arm", [NODE]), lambda: daemon.drop_group("arm")):
+        with pytest.raises(FrozenError, match=r"is being measured \(m1\)"):
+            change()
+    assert [(group["uuids"], group["measuring"]) for group in daemon.groups()] == [([OTHER], True)]
+    measured.clear()
+    daemon.drop_group("arm")
+    assert daemon.groups() == []
+    with pytest.raises(NotFoundError):
+        daemon.change_group("arm", [])
+
+
+def looks(bench: Bench, count: int) -> None:
+    """Let the daemon look at its store so many times."""
+    left = [False] * count + [True]
+    bench.daemon._stop = SimpleNamespace(wait=lambda _seconds: left.pop(0))  # type: ignore[assignment]
+    bench.daemon._observe()
+
+
+def test_what_another_process_changed_in_the_store_is_read_again_names_of_topics_too(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, version, done = bench.daemon, [daemon_version := object()], list[str]()
+    daemon._version = daemon_version
+    monkeypatch.setattr(bench.station, "version", lambda: version[0])
+    monkeypatch.setattr(daemon.directory, "refresh", lambda *_uuids: done.append("nodes"))
+    monkeypatch.setattr(daemon.names, "forget", lambda: done.append("names"))
+    monkeypatch.setattr(daemon.directory, "follow_profiles", lambda: [NODE])
+    looks(bench, 1)
+    assert (done, bench.events) == ([], [("node", "changed")])
+    version[0] = object()
+    looks(bench, 2)
+    assert (done, bench.events.count(("store", "changed"))) == (["nodes", "names"], 1)
+
+
+def test_a_store_that_fails_is_looked_at_again_and_one_of_a_newer_version_ends_the_service(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures: list[Exception | None] = [StoreError("The disk is away."), None, NewerStoreError("Schema 99.", hint="x")]
+    ended: list[bool] = []
+    bench.daemon._ends = lambda: ended.append(True)
+
+    def current_vault() -> None:
+        if failure := failures.pop(0):
+            raise failure
+
+    monkeypatch.setattr(bench.daemon, "_look_at_vault", current_vault)
+    looks(bench, 9)
+    assert (failures, ended, bench.events) == ([], [True], [("store", "newer")])
+    assert isinstance(bench.daemon.failure, NewerStoreError)
+
+
+def test_a_node_is_named_by_its_uuid_a_piece_of_it_or_its_name(bench: Bench) -> None:
+    daemon = bench.daemon
+    bench.station.nodes.remember(bytes.fromhex(NODE), name="hand")
+    daemon.directory.note(OTHER, "came", present=True)
+    for text, uuid in (("hand", NODE), ("0x" + NODE.upper(), NODE), (OTHER, OTHER), (OTHER[:4], OTHER)):
+        assert daemon.known(text) == uuid
+    for text in (OTHER[:3], "ef" * 10, "foot"):
+        with pytest.raises((NotFoundError, UsageError)):
+            daemon.known(text)
+
+
+def test_a_node_is_told_to_blink_in_the_session_in_which_it_is_measured(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(
+        "teds_provision.ncap.daemon.locate_measured", lambda node, seconds: told.append((node, seconds))
+    )
+    monkeypatch.setattr(bench.daemon.node_jobs, "with_node", lambda uuid, what, _work: told.append((uuid, what)))
+    node = SimpleNamespace(sealed=True)
+
+    class Session:
+        def __enter__(self) -> Any:
+            return SimpleNamespace(node=node)
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr(bench.daemon.measuring, "session", lambda _uuid, *, streaming: Session() if streaming else None)
+    bench.daemon.locate(NODE, 3)
+    node.sealed = False
+    bench.daemon.locate(NODE, 3)
+    assert told == [(node, 3), (NODE, "locate")]
