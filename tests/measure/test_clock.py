@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import random
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -18,6 +15,7 @@ from hypothesis import strategies as st
 from teds_provision.measure.clock import (
     AT_FIRST,
     BUCKET,
+    EXCHANGES,
     STEP,
     ClockMap,
     Exchange,
@@ -30,6 +28,7 @@ from teds_provision.measure.running.streams import NodeStreams
 from teds_provision.measure.verified_session import exchange_clock
 from teds_provision.protocol.operation.stream_commands import ClockReply
 from tests.pace import best_of
+from tests.work import COUNTS_BLOCKS, kept_by_each_thread
 
 SECOND = 1_000_000_000
 BOOT = 77 * SECOND  # host time at the node's tick 0
@@ -273,46 +272,22 @@ def test_a_clock_that_turns_out_worse_than_it_said_is_judged_anew_and_no_liar() 
     assert clock.lie == ""
 
 
-_MANY_THREADS = """
-import ctypes, threading
-from teds_provision.measure.clock import EXCHANGES, ClockMap, Exchange
+_EXCHANGES = """
+from teds_provision.measure.clock import ClockMap, Exchange
 
-class Blocks(ctypes.Structure):  # mallinfo2(3)
-    _fields_ = [
-        (name, ctypes.c_size_t)
-        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "used", "free", "keepcost")
-    ]
-
-mallinfo = ctypes.CDLL(None).mallinfo2
-mallinfo.restype = Blocks
-THREADS, FIRST, LAST = 100, 10, EXCHANGES + 10
-turns, done = [threading.Semaphore(0) for _ in range(THREADS)], threading.Semaphore(0)
-
-def run(turn):
-    clock = ClockMap()
-    for tick in range(0, LAST * 13 * 10**9, 13 * 10**9):
-        turn.acquire()
+def begin():
+    clock, ticks = ClockMap(), iter(range(0, 10**13, 13 * 10**9))
+    def act():
+        tick = next(ticks)
         assert clock.exchange(Exchange(tick, tick + 2_000_000, tick + 300_000, tick + 900_000, 1000, 50)), clock.lie
-        done.release()
-
-for turn in turns:
-    threading.Thread(target=run, args=(turn,), daemon=True).start()
-for round in range(LAST - 1):
-    for turn in turns:
-        turn.release()
-    for turn in turns:
-        done.acquire()
-    if round == FIRST:
-        first = mallinfo().used
-print((mallinfo().used - first) // THREADS)
+    return act
 """
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="the C library does not count its blocks")
+@pytest.mark.skipif(not COUNTS_BLOCKS, reason="the C library does not count its blocks")
 def test_exchanges_leave_nothing_in_the_cache_of_each_nodes_thread() -> None:
     """The fit of n exchanges took arrays of n numbers: blocks of each size stayed with each thread, 10 kB a node."""
-    asked = subprocess.run([sys.executable, "-c", _MANY_THREADS], capture_output=True, check=True, text=True)
-    assert int(asked.stdout) < 3000, "octets a thread"
+    assert kept_by_each_thread(_EXCHANGES, first=10, rounds=EXCHANGES + 10) < 3000
 
 
 def test_of_another_streams_older_bucket_nothing_is_added_to_the_hull() -> None:

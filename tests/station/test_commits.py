@@ -22,6 +22,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.audit import ACTOR
 from teds_provision.station.store.records import NodeRecord
 from tests.bench import Board, MemoryLink, make_station, talk
+from tests.work import COUNTS_BLOCKS, kept_by_each_thread
 
 _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")
 
@@ -407,3 +408,27 @@ def test_a_damaged_row_between_the_nodes_of_a_chunk_is_an_error_of_the_store(wat
             watched.station.nodes.put(NodeRecord(uuid, name=uuid.hex()))
     with pytest.raises(StoreError, match="damaged"):
         watched.station._store.read_of_nodes(unreadable, "SELECT uuid, name FROM nodes", uuids)
+
+
+_STATEMENTS = """
+import sqlite3
+from collections import deque
+from pathlib import Path
+from teds_provision.station.store.connection import Connection
+
+store = Connection(Path("store"), sqlite3.connect(":memory:", check_same_thread=False, isolation_level=None))
+others = deque(maxlen=100)
+
+def begin():
+    def act():
+        for _ in range(9):
+            store.execute("SELECT 1")
+            others.append(bytes(1500))  # what is in between, so that no block grows where it is; too long for a cache
+    return act
+"""
+
+
+@pytest.mark.skipif(not COUNTS_BLOCKS, reason="the C library does not count its blocks")
+def test_statements_leave_nothing_in_the_cache_of_each_nodes_thread() -> None:
+    """The connection's list of cursors was made longer by all threads in turn: each kept its former memory."""
+    assert kept_by_each_thread(_STATEMENTS, first=3, rounds=90) < 1500

@@ -115,6 +115,12 @@ class Connection:
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
         self._connection = connection
+        self._cursor = connection.cursor()
+        """Of every statement whose rows are fetched at once, under the lock.
+
+        The connection keeps each new cursor in a list that it tidies every 200: whichever thread makes the list longer
+        is left with its former memory, so hundreds of threads would grow for hours.
+        """
         self._lock = threading.RLock()
         self._depth = 0
         self._steady: int | None = None
@@ -139,11 +145,11 @@ class Connection:
             self.drain()
         with self._lock:
             try:  # without _run(), because each step executes dozens of statements
-                return self._connection.execute(statement, values).fetchall()
+                return self._cursor.execute(statement, values).fetchall()
             except (sqlite3.Error, OSError, UnicodeError) as error:
                 if not self._is_to_wait(error):
                     raise self._failure(error) from error
-            return self._wait_for(lambda: self._connection.execute(statement, values).fetchall())
+            return self._wait_for(lambda: self._cursor.execute(statement, values).fetchall())
 
     def drain(self) -> None:
         """Wait until what this thread has had taken in the background is done; raises what that raised."""
@@ -158,7 +164,7 @@ class Connection:
 
     def change(self, statement: str, values: Sequence[Any] = ()) -> int:
         """Run one statement and return how many rows it changed; raises StoreError."""
-        return self._run(lambda: self._connection.execute(statement, values).rowcount)
+        return self._run(lambda: self._cursor.execute(statement, values).rowcount)
 
     def execute_many(self, statement: str, rows: Iterable[Sequence[Any]]) -> None:
         """Run one statement with each row of values, all or none; raises StoreError."""
@@ -200,7 +206,7 @@ class Connection:
     def require_known_schema(self) -> None:
         """Raise NewerStoreError if a newer version of this tool has brought the store to its schema meanwhile."""
         with self._lock:
-            version = self._connection.execute("PRAGMA user_version").fetchone()[0]
+            version = self._cursor.execute("PRAGMA user_version").fetchall()[0][0]
         if version > SCHEMA_VERSION:
             raise newer_schema(self.path, version)
 
