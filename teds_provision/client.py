@@ -398,7 +398,7 @@ class Client:
         return list(self.request("GET", "/updates")["updates"])
 
     def follow_update(self, update_id: str) -> Update:
-        """Return how an update goes."""
+        """Return the progress of an update."""
         found: Update = self.request("GET", f"/updates/{quote(update_id, safe='')}")
         return found
 

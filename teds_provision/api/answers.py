@@ -643,7 +643,7 @@ class LineStation(TypedDict):
 
 
 class JobStatus(Job):
-    """How a job goes, station by station."""
+    """Progress of a job, per station."""
 
     stations: list[LineStation]
 

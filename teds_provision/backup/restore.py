@@ -1,4 +1,4 @@
-"""``restore``: a lost station comes back, or what a living one lacks is brought back; nothing ever goes back.
+"""``restore``: rebuild a lost station, or add what an existing one lacks; newer state is never undone.
 
 Into an empty home the backup comes as it is. Into the home of the same station it is merged in one transaction: what is
 missing comes back, what is newer stays. Epochs and sequences take the greater of both, keys of the present state are
@@ -182,7 +182,7 @@ def bring_vault(
 
 
 def open_vault_of(station: Station, ask: Ask) -> None:
-    """Open the vault of a living station, before anything is held; one that is lost is no failure yet.
+    """Open the vault of an existing station, before any lock is held; a lost vault is not an error yet.
 
     Raises WrongPassphraseError, VaultChangedError.
     """

@@ -89,7 +89,7 @@ def locate(probe: Probe) -> str:
 
 @rule("locate-keyed", _SECTION, Stage.KEYED)
 def locate_keyed(probe: Probe) -> str:
-    """Check that a board with a key does not blink outside a session; state goes before form."""
+    """Check that a board with a key does not blink outside a session; the state is checked before the form."""
     _known(probe)
     probe.refused(_locate(_SECONDS), Reason.NOT_PERMITTED, "outside a session, with a key")
     return probe.refused(_locate(), Reason.NOT_PERMITTED, "no octet, outside a session, with a key")
@@ -97,7 +97,7 @@ def locate_keyed(probe: Probe) -> str:
 
 @rule("manage-needs-session", _SECTION, Stage.PLAIN)
 def manage_needs_session(probe: Probe) -> str:
-    """Check that no packet passes outside a session, and that state goes before form."""
+    """Check that no packet passes outside a session, and that the state is checked before the form."""
     _known(probe)
     probe.refused(security_command(Function.MANAGE), Reason.NOT_PERMITTED, "no packet, outside a session")
     return probe.refused(security_command(Function.MANAGE, _PARAMETERS), Reason.NOT_PERMITTED, "outside a session")

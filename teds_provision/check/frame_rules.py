@@ -1,6 +1,6 @@
 """Rules of single CAN frames: addresses, functional requests, ISO-TP as it is written, Announce. Nothing is kept.
 
-A base station of the check's own, at an address that nothing else uses, sends and hears the frames one by one.
+The check acts as a base station at an unused address, and sends and receives single frames.
 """
 
 from __future__ import annotations

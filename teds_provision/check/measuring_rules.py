@@ -305,7 +305,7 @@ def operate_values(probe: Probe) -> str:
 
 @rule("operate-expires", "1. A channel is claimed or idle", Stage.MEASURING, page=OPERATION_PAGE)
 def operate_expires(probe: Probe) -> str:
-    """Check that a session without a good Sealed frame for its lease loses its claims, and goes on."""
+    """Check that a session without a good Sealed frame for its lease loses its claims, but remains open."""
     channel = _sensor(probe)
     for lease in _SHORT_LEASES:
         began = probe.now()

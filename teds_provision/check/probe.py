@@ -58,7 +58,7 @@ class RuleBrokenError(Exception):
 
 
 class NotApplicableError(Exception):
-    """The rule cannot be tried on this node, link or state, which is no fault of the node.
+    """The rule does not apply to this node, link or state; the node is not at fault.
 
     The text gives the reason.
     """

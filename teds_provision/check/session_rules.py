@@ -156,7 +156,7 @@ def sealed_last_counter(probe: Probe) -> str:
 
 @rule("sealed-counter", "Sessions", Stage.SESSION)
 def sealed_counter(probe: Probe) -> str:
-    """Check that gaps are accepted; a used counter, a lower one and 0 get 13; the session goes on."""
+    """Check that gaps are accepted; a used counter, a lower one and 0 get 13; the session remains open."""
     session = probe.open()
     last = session.seal(IDENTIFY, counter=9)
     session.unseal(probe.good(last).ljust(36, b"\0"))

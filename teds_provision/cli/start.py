@@ -24,7 +24,7 @@ _SHOWN = 20
 
 
 def start(app: App, ctx: click.Context) -> None:
-    """Show one screen: the station, its links and who answers there, what is wrong, and what to run next."""
+    """Show one screen: the station, its links and their nodes, problems, and the next command."""
     try:
         station = app.station()
     except NotFoundError:

@@ -55,7 +55,7 @@ def _names(node: DescribedNode) -> dict[int, str]:
     found: dict[int, str] = {}
     for channel in node.sheet.channels:
         own = re.sub(r"\W+", "_", channel.name.lower(), flags=re.ASCII).strip("_") or f"channel_{channel.number}"
-        while own in found.values():  # "a", "a 3" and "a" as channels 1, 2 and 3 need the number twice
+        while own in found.values():  # channels "a", "a 3" and "a" with numbers 1, 2 and 3 need the number twice
             own = f"{own}_{channel.number}"
         found[channel.number] = own
     return found

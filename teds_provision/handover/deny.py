@@ -40,7 +40,7 @@ def deny(station: Station, statement: Statement, *, key: str | None) -> None:
         entry = RevocationRecord(statement.uuid, named, statement.why, statement.statement, created)
         station.policy.deny(entry)
         station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
-        if station.plant.joined is not None:  # a page may have lifted it before it came
+        if station.plant.joined is not None:  # a page with its lifting may have arrived before the ban
             station.plant.claims.queue([statement.uuid])
 
 

@@ -364,7 +364,7 @@ class _Judge:
                 yield PlannedNode(node, "refused", why) if why else self._taken(node)
 
     def _turn_to(self, chunk: Sequence[BundledNode]) -> None:
-        """Read what is known here of a chunk of nodes, and who has their names."""
+        """Read the rows of a chunk of nodes, and the nodes that already have their names."""
         station, uuids = self.station, [node.uuid for node in chunk]
         self.nodes = station.nodes.get_many(uuids)
         self.pins = station.pins.pinned_among(self.nodes.values(), station.pins.get_many(uuids).values())

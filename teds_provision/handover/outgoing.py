@@ -57,7 +57,7 @@ class ExportOrder:
 
 
 class LeavingNode(NamedTuple):
-    """A node that goes, by its UUID, and the key that it has now: the rest is read when it is sealed."""
+    """A node to export, by UUID, with its present key; the rest is read when the bundle is sealed."""
 
     uuid: bytes
     key_id: str
@@ -367,7 +367,7 @@ def seal_export(station: Station, plan: ExportPlan, now: datetime) -> SealedBund
 
 
 def record_export(station: Station, sealed: SealedBundle) -> None:
-    """Note who holds what from now on; the caller holds the transaction in which the parcel is kept."""
+    """Record the new holders; the caller's transaction also stores the parcel."""
     _record(station, sealed.plan, (sealed.sha256, sealed.signed_sha256))
 
 
@@ -573,7 +573,7 @@ def _files_before(plan: ExportPlan) -> tuple[str, ...]:
 
 
 def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) -> None:
-    """Record who holds the keys from now on: each receiver of a copy too; after a move, the receiver alone."""
+    """Record the new holders of the keys: after a copy, each receiver too; after a move, only the receiver."""
     now, uuids_of_nodes = utc_now(), [node.uuid for node in plan.nodes]
     if plan.mode == "copy":
         station.bulk.put(BulkRows(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers]))

@@ -68,7 +68,7 @@ class BundleNotes:
 def content_digest(
     sender: str, to: Iterable[str], mode: str, ca: bytes, nodes: Iterable[tuple[bytes, str, int]]
 ) -> str:
-    """Return a digest that identifies a handover: who gives which keys (UUID, keyId, epoch) of which CA to whom.
+    """Return a digest that identifies a handover: sender, receivers, mode, CA, and keys (UUID, keyId, epoch).
 
     No time and no id: the same command gives the same digest again. Key ids are public, keys are not in it. ``nodes``
     ascend by UUID. The digest is over JSON, which is streamed and never built as a whole.

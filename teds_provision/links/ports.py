@@ -24,7 +24,7 @@ NoticeKind = Literal[
 
 @dataclass(frozen=True)
 class Notice:
-    """A message for people while a port works: what it waits for, or something that came and is no node.
+    """A message for the user while a port works: what it waits for, or a tag that is not a node.
 
     Units: ``seconds`` is how long this wait may still last, None for as long as it takes. ``uuid`` is the node
     concerned, if there is one.
@@ -200,7 +200,7 @@ class BusFrames(Protocol):
 
 @runtime_checkable
 class FramedLink(Protocol):
-    """A node's line on a bus whose frames can be sent and heard one by one, to see what a node makes of them (CAN)."""
+    """A link whose single frames can be sent and received, to test a node's handling of them (CAN)."""
 
     def single_frames(self) -> AbstractContextManager[BusFrames]:
         """Hear every frame of nodes from now on, until the block ends."""
@@ -355,7 +355,7 @@ ContactSink = Callable[[Contact], object]
 
 @runtime_checkable
 class EarlyFinder(Protocol):
-    """A port that shows nodes while it still asks who else is there (CAN)."""
+    """A port that yields nodes while its search is still running (CAN)."""
 
     def find_all_early(self, *, seconds: float, notice: NoticeSink, listen: float, seen: ContactSink) -> list[Contact]:
         """Return what ``Port.find_all`` returns; ``seen`` is called with each node as soon as it has answered.

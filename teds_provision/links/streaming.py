@@ -26,7 +26,7 @@ class DataMessage(NamedTuple):
 
 
 class DataListener(Protocol):
-    """The data messages of a link, heard by one thread. ``lost`` counts what was dropped for lack of time."""
+    """The data messages of a link, received by one thread. ``lost`` counts those that were dropped for lack of time."""
 
     @property
     def lost(self) -> int:

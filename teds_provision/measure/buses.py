@@ -1,4 +1,4 @@
-"""The links of this process that stream, each read and searched by one thread for all who measure on it.
+"""The links of this process with streams, each read and searched by one thread for all its measurements.
 
 Measurements, detection and commands share them: they are opened once, and closed when the process ends.
 """
@@ -19,7 +19,7 @@ from teds_provision.measure.stream_receiver import HearingThread
 
 
 class MeasuredBus:
-    """One link that carries data: ``port``, who hears its data messages, how much of it is taken, who is on it."""
+    """One link that carries data: its ``port``, the thread that receives data messages, its load, and its nodes."""
 
     def __init__(self, port: MeasuringLink, sightings: SightingSink, *, poll: float | None) -> None:
         self.port = port
@@ -99,7 +99,7 @@ class Buses:
             bus.discovery.poll(seconds)
 
     def discover(self) -> list[Sighting]:
-        """Ask every bus now; who answered until now. A bus that has failed is left out, the last failure raised."""
+        """Send a broadcast on every bus; return the nodes seen so far. Skips failed buses; raises if all failed."""
         failure: LinkError | None = None
         worked = 0
         for bus in self.all():

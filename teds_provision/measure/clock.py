@@ -405,7 +405,7 @@ class HostClock:
 
 
 class MonotonicStamps:
-    """Stamps of one stream never go back, whatever a refit changes."""
+    """Keeps the stamps of one stream ascending, even after a refit."""
 
     def __init__(self) -> None:
         self._last = -np.inf

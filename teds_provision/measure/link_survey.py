@@ -1,4 +1,4 @@
-"""Which nodes answer now on the links of a station: one short question a bus, beside whatever runs there."""
+"""Find the nodes on a station's links: one short broadcast per bus, beside any measurement there."""
 
 from __future__ import annotations
 

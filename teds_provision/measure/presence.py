@@ -244,14 +244,14 @@ class Presence:
 
 
 def _take_one(counts: Counter[Any], key: object) -> None:
-    """Count one less; what is not counted any more goes."""
+    """Decrement a count, and remove it at zero."""
     counts[key] -= 1
     if not counts[key]:
         del counts[key]
 
 
 def _discard(index: dict[_Key, set[bytes]], key: _Key, uuid: bytes) -> None:
-    """Take a node out of an index; a key without nodes goes."""
+    """Remove a node from an index, and its key if no node is left."""
     index[key].discard(uuid)
     if not index[key]:
         del index[key]

@@ -58,7 +58,7 @@ def require_measurable(station: Station, uuid: bytes) -> None:
 
 
 def why_not_measured(station: Station, uuid: bytes) -> str:
-    """Return why a node cannot be measured whatever is asked for; "" if its session decides."""
+    """Return why a node cannot be measured at present; "" if only its session can decide."""
     try:
         require_measurable(station, uuid)
     except (NotAuthenticError, PolicyError) as error:

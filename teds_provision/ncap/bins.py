@@ -17,7 +17,7 @@ from teds_provision.arrays import NDArray, np
 _LATE: Final = 2.0  # seconds by which samples may arrive late; beyond that, the clock was set back
 _MOST_FEW: Final = 1500  # bins; so many need two thirds of the memory of a ring with 6,000
 _TIDY: Final = 32  # bins between two removals of old ones
-_RARE: Final = 40  # bins with losses that are kept one by one; a row of all bins is smaller than more of them
+_RARE: Final = 40  # bins with losses that are stored singly; for more of them, an array of all bins is smaller
 _FARTHEST: Final = 3e38  # largest distance between two values of a bin
 _REAL, _BITS = struct.Struct("<f"), struct.Struct("<I")
 
@@ -81,7 +81,7 @@ class Bins(SegmentedBins):
         self._low = np.full(size, np.nan, np.float32)
         self._high = np.zeros(size, np.uint16) if coarse else np.full(size, np.nan, np.float32)
         self._type, self._most = counts, int(np.iinfo(counts).max)
-        # Samples, invalid, lost; the last two are bins one by one while they are few.
+        # Samples, invalid, lost; of the last two, a few bins are stored singly.
         self._counts: list[NDArray[Any] | dict[int, int]] = [
             np.zeros(self.size, self._type),
             *({} for _ in range(1 if coarse else 2)),

@@ -184,7 +184,7 @@ class MeasurementSupervisor:
             self._consider(running, uuid)
 
     def look_who_is_meant(self) -> None:
-        """Re-evaluate who may be measured, after this process changed a group, a key or a datasheet."""
+        """Select the nodes again, after this process changed a group, a key or a datasheet."""
         with self._lock:
             for running in self._running.values():
                 running.asked_anew = True
@@ -850,7 +850,7 @@ class MeasurementSupervisor:
         return sighting is not None and sighting.identity.state == NodeState.FACTORY
 
     def _consider(self, running: RunningMeasurement, uuid: str) -> None:
-        """Take a node's lock if a measurement selects it and it is free; in whichever thread hears it."""
+        """Acquire a node's lock if a measurement selects it and it is free; called from any thread."""
         membership, says_factory = running.membership, self._says_factory(uuid)
         with self._lock:
             may_come = running.phase is Phase.MEASURING and membership.may_come(uuid, says_factory=says_factory)

@@ -234,7 +234,7 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
     station.plant.claims.add_ids(chain.id, known)
     station.plant.claims.put_digests(chain, digests)
     _keep_bans(station, chain, events, counts=True)
-    if lifted:  # a ban that came in a bundle is in no page, so that only the deny list shows which node it is of
+    if lifted:  # a ban from a bundle is on no page, so only the deny list has its node
         station.plant.claims.queue(
             ban.uuid for ban in station.policy.revocations() if event.hash_of_statement(ban.statement) in lifted
         )

@@ -1,4 +1,4 @@
-"""Take in the pages of other stations (contract/plant.md section 2): whatever the transport, the signature decides."""
+"""Take in the pages of other stations (contract/plant.md section 2); only the signature decides, not the transport."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def take_carried(
 ) -> Taken:
     """Keep the pages of one station that are new and follow one that is here; ``pages`` ascend by number.
 
-    A page that the station did not sign is no page: it ends nothing and may be asked for again.
+    A page that the station did not sign is ignored, and may be requested again.
     """
     links = station.plant.pages.chain_links(station.plant.pages.chain(author).id)
     known, numbers = {hash for _, hash, _ in links}, {n for n, _, _ in links} | {0}

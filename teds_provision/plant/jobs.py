@@ -92,7 +92,7 @@ def find_job(station: Station, text: str) -> Job:
 
 
 def take_received(station: Station) -> None:
-    """Take the jobs that a sync brought; one that is no keeper's is dropped, and reported."""
+    """Take the jobs that a sync brought; a job not signed by a keeper is dropped and reported."""
     for row, octets in parcels.received(station, "job"):
         try:
             take_job(station, octets)

@@ -115,7 +115,7 @@ def answer_all(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[AnsweredRequest]:
-    """Answer every request that came, one after the other; each answer is on its way before its parcel goes."""
+    """Answer all received requests in turn; each request's parcel is dropped only after its answer was sent."""
     for come in inbox.collect():
         if stop():
             return

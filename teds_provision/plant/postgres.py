@@ -215,7 +215,7 @@ class Registry:
                 connection.close()
 
     def interrupt(self) -> None:
-        """End whatever another thread waits for here: its connection is cut, and what it asks fails."""
+        """Interrupt a waiting thread by closing its connection; its request fails."""
         connection = self._connection
         if connection is not None:
             _shut(connection)
@@ -463,7 +463,7 @@ class PostgresTransport:
         yield from self._registry.small_parcels(to, known)
 
     def send(self, parcel: Parcel) -> None:
-        """Leave a parcel; a large one is not sent twice only to hear that it is there."""
+        """Store a parcel in the registry; a large one is sent only if it is not there yet."""
         if len(parcel.octets) <= SMALL or all(waiting.id != parcel.id for waiting in self._look.parcels):
             self._registry.send(parcel.id, parcel.to, parcel.octets, datetime.fromisoformat(parcel.expires))
 
@@ -472,7 +472,7 @@ class PostgresTransport:
         self._registry.remove([parcel])
 
     def interrupt(self) -> None:
-        """Cut the connection under whatever another thread does with it."""
+        """Close the connection even if another thread is using it."""
         self._registry.interrupt()
 
     def close(self) -> None:

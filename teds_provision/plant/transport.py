@@ -132,7 +132,7 @@ class Transport(Protocol):
         """Send a parcel; the same id again changes nothing. Raises PolicyError if no more is accepted."""
 
     def drop(self, parcel: str, to: str) -> None:
-        """Throw a parcel away; one that is gone is no error."""
+        """Delete a parcel, if it still exists."""
 
     def close(self) -> None:
         """Let go of it."""

@@ -225,7 +225,7 @@ class _Work:
 
 
 def judge_file(grounds: EvidenceAnchors, path: Path) -> JudgedEvidence:
-    """Judge one file; whatever is wrong with it is in what is returned."""
+    """Judge one file; the result contains all faults."""
     return judge_files(grounds, [str(path)])[0]
 
 

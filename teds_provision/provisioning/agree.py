@@ -89,7 +89,7 @@ def open_session(station: Station, node: Conversation, *, word: bool = False) ->
 def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
     """Make a key the active one after a good Open under it.
 
-    Epoch and sequence of a bundle are hearsay until here: the node's own words in this session replace them.
+    Epoch and sequence from a bundle are unverified until here: those that the node reports in the session replace them.
     """
     uuid, record = node.uuid, held.record
     station.nodes.met_at(uuid, without_source(node.contact.bus))

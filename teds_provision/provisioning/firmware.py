@@ -107,7 +107,7 @@ def firmware_warning(known: KnownFirmware | None) -> str:
 def keep_firmware(station: Station, uuid: bytes, reading: FirmwareReading | None, *, signed: bool = False) -> None:
     """Keep a node's answer. ``signed``: its datasheet was signed now, under this firmware.
 
-    The plant hears of a change that the node reported in a session; an unauthenticated answer is kept here alone.
+    A change reported in a session becomes an event of the plant; an unauthenticated report is only stored here.
     """
     if reading is None:
         return

@@ -98,7 +98,7 @@ class ImageManager:
         self._ask(request, self._image.ImageStatesWriteResponse, "to keep the image")
 
     def restart(self) -> None:
-        """Restart the board; a lost reply is no error, because its c shows later if it restarted."""
+        """Restart the board; a lost reply is not an error, because c of the next Open shows if it restarted."""
         with suppress(NodeSilentError, GarbledError, SessionLostError):
             self._ask(self._os.ResetWriteRequest(), self._os.ResetWriteResponse, "to restart")
         self._node.forget()

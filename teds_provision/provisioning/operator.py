@@ -15,7 +15,7 @@ from teds_provision.teds.diff import Change
 
 
 class Operator:
-    """Nobody can be asked: whatever needs a person's yes is refused."""
+    """No operator is present: everything that needs a confirmation is refused."""
 
     def accept(self, who: IdentifiedNode) -> None:
         """Ask before an unknown node is whitelisted; raises NotWhitelistedError."""
@@ -53,7 +53,7 @@ class Operator:
 
 
 class AcceptingOperator(Operator):
-    """Who began this named the very board, or means whichever comes: it is whitelisted. Everything else is refused."""
+    """The caller named the board or accepts any: it is whitelisted. Everything else is refused."""
 
     def accept(self, who: IdentifiedNode) -> None:
         """Return for every board."""

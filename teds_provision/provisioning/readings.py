@@ -96,7 +96,7 @@ def keep_judged(
 
 
 def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) -> None:
-    """Keep the Security TEDS that a node showed in no session: its key, for who builds; it is no datasheet."""
+    """Store a Security TEDS that was read outside a session: its key is needed for building; it is not a datasheet."""
     image = Image(uuid, {SECURITY: security_teds})
     signers = static_checks(image, None)[1]
     station.datasheets.keep_reading(NodeReading(uuid, utc_now(), by, None, False, _packed(image), *signers))

@@ -38,7 +38,7 @@ class PinLookup(Protocol):
 
 
 class TrustLookup(Protocol):
-    """Whose signatures count, and who is denied."""
+    """The trusted signers, and the denied nodes."""
 
     def revocation(self, uuid: bytes) -> RevocationRecord | None:
         """Return why a node is denied, None if it is not."""

@@ -135,7 +135,7 @@ _Read = tuple[str, Image | TedsProvisionError]
 
 
 def _some(files: Sequence[str]) -> Iterator[list[_Read]]:
-    """Read images, some at a time: as many as are no burden to hold together."""
+    """Read images in chunks that are small enough for memory."""
     some: list[_Read] = []
     octets = 0
     for file in files:

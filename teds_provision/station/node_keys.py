@@ -228,7 +228,7 @@ class NodeKeys:
                 uuid: (epoch, vault.unwrap(wrapped, context=node_key_context(store, uuid, epoch, slot)))
                 for uuid, _, epoch, slot, wrapped in rows
             }
-        except UnknownMasterKeyError:  # as unwrap(): the rows or the vault were read too early
+        except UnknownMasterKeyError:  # as in unwrap(): the rows or the vault were read before the change
             named = (key for key in self.get_many(list(key_ids)) if key_ids[key.uuid] == key.key_id)
             return {key.uuid: (key.epoch, self.unwrap(key)) for key in named}
 

@@ -74,7 +74,7 @@ def is_damage(failure: StoreError) -> bool:
 
 
 def relation(copy: Station, live: Station) -> Relation:
-    """Compare the audit logs of a copy and of a store: the one that goes on after the end of the other is the newer."""
+    """Compare the audit logs of a copy and of a store: the one that continues the other is the newer."""
     ours, theirs = live.audit_log.check(), copy.audit_log.check()
     if (ours.count, ours.head) == (theirs.count, theirs.head):
         return Relation.SAME
@@ -86,7 +86,7 @@ def relation(copy: Station, live: Station) -> Relation:
 
 
 def extend_audit(live: Station, copy: Station) -> int:
-    """Append what a newer copy's audit log goes on with; returns how many entries. Call it inside a transaction."""
+    """Append the entries that only a newer copy's audit log has; return their number. Call it inside a transaction."""
     store, after = live._store, live.audit_log.check().count
     rows = copy._store.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq", (after,))
     for row in rows:

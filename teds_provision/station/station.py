@@ -78,7 +78,7 @@ __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", 
 
 @dataclass(frozen=True)
 class _JoiningStep:
-    """Rows for the transaction of the next durable step, and who learns that they are kept."""
+    """Rows for the transaction of the next durable step, and a callback once they are stored."""
 
     write: Callable[[], object]
     kept: Callable[[], object]
@@ -86,7 +86,7 @@ class _JoiningStep:
 
 @dataclass
 class _DurableRun:
-    """A run of steps: who takes some in the background, and the number of its ``last`` commit not waited for.
+    """A run of steps: its background writer, and the number of its ``last`` commit that was not waited for.
 
     ``joining``: what its next durable step writes as well.
     """
@@ -411,11 +411,11 @@ class Station:
             self._store.flush(run.last)  # only this run's commits: other threads flush their own
 
     def run_in_background(self, step: Callable[[], object]) -> None:
-        """Take a durable step while the node is talked to: in a :meth:`run` by its own thread, elsewhere at once.
+        """Run a durable write during exchanges with the node: within :meth:`run` in its background thread, else now.
 
-        Whatever is asked of the store afterwards waits for it, and raises what it raised; the run ends with it. So the
-        order of durable writes stays that of the program, and only messages to the node may overtake the step: it is
-        for what none of those that may follow depends on. Not inside a durable step.
+        Later calls of the store wait for it and raise its error; the run ends after it. So the order of durable writes
+        is that of the program, and only messages to the node may overtake this one: use it only if no message that may
+        follow depends on it. Not inside a durable step.
         """
         run: _DurableRun | None = getattr(self._runs, "now", None)
         if run is None:

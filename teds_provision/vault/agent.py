@@ -215,7 +215,7 @@ def _answer(line: socket.socket, page: LockedPage, until: float) -> bool:
 
 
 def _now() -> float:
-    """Return seconds of a clock that goes on while the machine sleeps."""
+    """Return seconds of a clock that also runs while the machine sleeps."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 

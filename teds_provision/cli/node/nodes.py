@@ -209,7 +209,7 @@ def _remarks(node: dict[str, Any]) -> str:
 
 
 def _verdict(node: dict[str, Any]) -> str:
-    """Return the verdict, and its basis; the reason for a retired node goes before it."""
+    """Return the verdict and its basis; for a retired node, the reason comes first."""
     read, retired = node["reading"], node["retired"]
     if read is None:
         return retired or node["verdict"] or "never verified"

@@ -1,4 +1,4 @@
-"""The station's Bluetooth: finds nodes by their service, asks each who it is, and keeps as few connections as it can.
+"""The station's Bluetooth port: finds nodes by their service, identifies each, and keeps few connections.
 
 Nodes are connected one after the other; a connection ends when its link is closed. Only measuring keeps several.
 """

@@ -119,7 +119,7 @@ class Arrivals:
     def pause(self, stop: threading.Event) -> None:
         """Wait until the next broadcast may be sent, or a node announces itself; the time of the round counts.
 
-        A board that was served may be changed meanwhile; what it announced while it was served is no news.
+        A finished board may be replaced meanwhile; its Announces while it was worked on do not count.
         """
         if self._listener is not None and not all(map(self._was_served, self._listener.get_all(0.0))):
             return
@@ -167,7 +167,7 @@ class Arrivals:
     def _is_news(self, address: int, identity: Identity) -> bool:
         """Return True if the node is new, back after silence, or reset to factory state.
 
-        A new address alone is no news.
+        A new address alone does not make a node new.
         """
         before = self._seen.get(identity.uuid)
         self._seen[identity.uuid] = _SeenNode(address, identity.state, self._round)

@@ -180,7 +180,7 @@ class Bus:
     def receive(self, seconds: float) -> Frame | None:
         """Return the next data frame that another sent, None when there is none; raises LinkError (also bus-off).
 
-        Waits ``seconds`` at most, and returns None before for what is no such frame.
+        Waits at most ``seconds``; returns None earlier after any other frame.
         """
         frame = self._receive_message(seconds) if self._multicast is None else self._heard(self._multicast, seconds)
         if frame is not None and self._trace is not None:

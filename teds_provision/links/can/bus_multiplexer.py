@@ -557,7 +557,7 @@ class BusMultiplexer:
             asked.until = time.monotonic() + _STRAGGLERS_SECONDS
 
     def has_conflict(self, node: int) -> bool:
-        """Return True if two nodes were heard under this address a short while ago, and no single one since then."""
+        """Return True if two nodes used this address recently, and no single one since then."""
         return time.monotonic() - self._clashes.get(node, -math.inf) < _CLASH_SECONDS
 
     # -- the loop and its callbacks --------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ class CanDiscovery(Discovery):
                 self._stop.wait(LEAST)
 
     def _watch(self) -> None:
-        """Ask, and hear announcements, until the bus fails."""
+        """Send broadcasts and receive Announces until the bus fails."""
         with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as listener:
             gone = self._presence.gone
             self._ask()

@@ -127,7 +127,7 @@ class Pair:
         )
 
     def send(self, body: bytes) -> None:
-        """Start to send; what is still under way goes first."""
+        """Start to send; a message in progress is sent first."""
         fd = bool(self._logic.params.can_fd)
         if 0 < len(body) <= (62 if fd else 7) and not self.sending:
             self._send_frame(Frame(self._send_id, single(body, fd=fd), fd))
@@ -136,7 +136,7 @@ class Pair:
         self.run()
 
     def handle_frame(self, frame: Frame) -> bool:
-        """Give in one frame; whether it was of this pair. We answer in the form (classic, FD) in which we are asked."""
+        """Process a received frame; return True if it is for this pair. Answers are classic or FD as the request."""
         if frame.identifier != self._receive_id:
             return False
         if (data := _tolerable(frame.data)) is None:

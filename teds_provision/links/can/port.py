@@ -163,7 +163,7 @@ class CanPort(MeasuringLink):
     ) -> Identity | None:
         """Ask one address for Identify; None if there is no answer. Raises AddressConflictError, LinkError.
 
-        ``until_announced``: stop as soon as a node announces itself there, as it has not heard the question; a caller
+        ``until_announced``: stop as soon as a node announces itself there, since it missed the request; a caller
         that asks because of the Announce need not wait for this one.
         ``once``: send one question, even if frames of its answer are missing.
         """

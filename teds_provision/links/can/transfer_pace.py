@@ -48,7 +48,7 @@ class TransferPace:
         self._free_at, self._counted, self._left = 0.0, 0.0, self._began
 
     def count(self, frame: Frame) -> None:
-        """Count a frame that was heard or sent: of a stream (also of Drive messages), or of a command or reply."""
+        """Count a received or sent frame: of a stream (or a Drive message), or of a command or reply."""
         octets = len(frame.data)
         seconds = self._fd[octets] if frame.fd else self._classic[min(octets, _CLASSIC_OCTETS)]
         kind = frame.identifier & 0x1FFF0000

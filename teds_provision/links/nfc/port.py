@@ -39,7 +39,7 @@ class NodeInField:
 
 @dataclass(frozen=True)
 class ForeignTag:
-    """A tag that is no node of ours; ``text`` describes it."""
+    """A tag without the profile's service; ``text`` describes it."""
 
     tag: ReaderTag
     text: str
@@ -124,7 +124,7 @@ class NfcPort:
     ) -> Contact:
         """Wait for the tap of a node for which ``wanted`` is true.
 
-        Tags that are no nodes and nodes that are not wanted are named once through ``notice`` and waited past.
+        Other tags and unwanted nodes are reported once through ``notice``, and then ignored.
         Raises NoNodeError after ``seconds``, NoReaderError when the reader is gone by then. ``address`` is of no use
         here.
         """

@@ -1,4 +1,4 @@
-"""Opens a recording of any format, identified by its first octets, whatever its name is."""
+"""Opens a recording of any format, identified by its first octets and not by its name."""
 
 from __future__ import annotations
 

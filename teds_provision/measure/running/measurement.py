@@ -46,7 +46,7 @@ ENDING = 10.0  # seconds for all nodes to be released
 
 @dataclass
 class Watcher:
-    """Who sees what goes on: a live table, lines of JSON. Each is called from the measurement's threads."""
+    """Callbacks for a live table or JSON lines, called from the measurement's threads."""
 
     block: Callable[[Block], None] = lambda _block: None
     facts: Callable[[Sequence[ChannelFacts]], None] = lambda _facts: None

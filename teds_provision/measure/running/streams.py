@@ -1,4 +1,4 @@
-"""The streams of one node and the clock that its samples are timed by: subscribed, heard, stopped, added up."""
+"""The streams of one node, with the clock for their time stamps: subscribing, receiving, stopping, totals."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class NodeStreams:
     def subscribe(
         self, bus: MeasuredBus, trusted: VerifiedSession, plan: StreamPlan, address: int, *, ahead: float = 0.0
     ) -> None:
-        """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
+        """Subscribe to a stream and receive it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
         before = self.running.get(number)
         pieces = bus.hearing.expect(address, number, plan.length)

@@ -54,7 +54,7 @@ class Sink(Protocol):
 
     @property
     def recorder(self) -> bool:
-        """True if it keeps whatever the disk has room for; else it is live."""
+        """True for a recorder, which drops nothing while the disk has room; False for a live sink."""
 
     @property
     def budgeted(self) -> bool:

@@ -235,7 +235,7 @@ class FileSink(ThreadedSink):
             self._wait_for_room(error)
 
     def _miss(self, item: Item) -> None:
-        """Count an item that comes while there is no room, for the next part's note."""
+        """Count an item that is dropped while the disk is full, for the next part's note."""
         if isinstance(item, Block):
             self._count(dropped=int(item.value.size))
         elif isinstance(item, tuple):

@@ -137,7 +137,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _retire(self, topic: str) -> None:
-        """Take back a topic that :meth:`_latched` made: who comes from now on finds nothing there."""
+        """Remove a topic made by :meth:`_latched`, so that new subscribers no longer get its message."""
 
     @abstractmethod
     def _parameter(self, name: str, value: object) -> None:

@@ -192,7 +192,8 @@ class MqttSink(ThreadedSink):
         changed = [channel_facts.key for channel_facts in facts if self._facts.get(channel_facts.key) != channel_facts]
         self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
         for uuid in {uuid for uuid, _ in changed}:
-            self._newest.pop(uuid, None)  # under a channel's former name its last value would go on as one of now
+            # the last value under a channel's former name would be repeated as a present one
+            self._newest.pop(uuid, None)
         own = {channel_facts.uuid for channel_facts in facts}
         touched = {uuid for uuid in self._topics.learn(facts) if uuid in own or uuid in self._parts_of_topics}
         self._units.update(

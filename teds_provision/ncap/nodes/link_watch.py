@@ -1,4 +1,4 @@
-"""A thread for each link: it opens it, again and again if need be, and sees who comes and who leaves.
+"""A thread for each link: opens it, reopens it after failures, and notices nodes that arrive and leave.
 
 A bus is asked by the look-out that measurements use as well, and its nodes are looked at by a few workers; at a reader
 the tap is served there and then, because the node may be taken away.
@@ -44,7 +44,7 @@ PATIENCE: Final = (1.0, 3.0)  # seconds to wait for the first answer, and for th
 
 
 class PresenceCheck:
-    """Asks the nodes of one bus. ``held`` returns nodes that other parts hear meanwhile: measured, or worked with."""
+    """Checks the nodes of one bus. ``held`` returns True for nodes in use, such as measured ones."""
 
     def __init__(self, port: MeasuringLink, held: Callable[[str], bool], waits: Waits = USUAL) -> None:
         self._port, self._held, self._silence = port, held, waits.silent_node
@@ -204,7 +204,7 @@ class LinkWatch:
         self._close()
 
     def _watch(self, port: Port) -> None:
-        """See who comes until the link fails or the daemon ends."""
+        """Handle arriving nodes until the link fails or the daemon ends."""
         if isinstance(port, MeasuringLink):
             with sole_user(self._station, [port], "ncap run"):
                 self._watch_bus(port)

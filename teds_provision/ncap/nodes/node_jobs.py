@@ -111,7 +111,7 @@ class NodeJob(Generic[Result]):
     error: TedsProvisionError | None = None
 
     def run(self, node: Conversation) -> None:
-        """Do it; what is raised is kept for who waits."""
+        """Run the job; errors are stored for the waiting thread."""
         try:
             self.result = self.work(node)
         except SessionLostError as lost:

@@ -171,7 +171,7 @@ class Provisioning:
         return run.as_json()
 
     def cancel(self, uuid: str) -> dict[str, Any]:
-        """Wait no more; a run that has begun goes on to its end. Raises NotFoundError."""
+        """Cancel the wait; a run that has begun continues to its end. Raises NotFoundError."""
         with self._guard:
             run = self._runs.get(uuid)
         if run is None:

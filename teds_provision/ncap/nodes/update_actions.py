@@ -138,7 +138,7 @@ class UpdateFolder:
         write_whole(self._record(action), action.record())
 
     def keep(self, action: UpdateAction) -> None:
-        """Write how an action goes; a disk that refuses ends no update, as the boards know how far they are."""
+        """Store the state of an action; a failed write ends no update, since the boards have their own state."""
         try:
             write_whole(self._record(action), action.record())
         except TedsProvisionError as error:

@@ -40,7 +40,7 @@ _OF_AN_ENTRY: Final = frozenset({"act", "uuid", "outcome"})
 
 
 def build(daemon: Daemon) -> Starlette:
-    """Return the application; the guard goes in front of it."""
+    """Return the application; the caller wraps it in a Guard."""
     routes: list[BaseRoute] = [
         Mount(
             API,

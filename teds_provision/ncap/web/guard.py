@@ -78,7 +78,7 @@ class Caller:
 
 @dataclass(eq=False)
 class RequestRefusedError(Exception):
-    """A request that goes no further: status, and code, message and hint as everywhere."""
+    """A refused request: status, code, message and hint."""
 
     status: int
     code: str

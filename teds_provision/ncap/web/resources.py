@@ -369,7 +369,7 @@ class Resources:
         )
 
     async def update(self, request: Request) -> Response:
-        """GET, DELETE /updates/ID: how an update goes; begin no further board."""
+        """GET, DELETE /updates/ID: progress of an update; begin no further board."""
         work = self._daemon.updates.get if request.method == "GET" else self._daemon.updates.cancel
         return _shown(request, await changing(work, request.path_params["id"]))
 

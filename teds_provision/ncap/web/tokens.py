@@ -72,7 +72,7 @@ class Tokens:
         return token
 
     def remove(self, name: str) -> int:
-        """Take tokens of this name away, at once also for who uses one now; raises NotFoundError."""
+        """Remove the tokens of this name, effective at once; raises NotFoundError."""
         with self._changing() as tokens:
             kept = [token for token in tokens if token.name != name]
             gone = len(tokens) - len(kept)

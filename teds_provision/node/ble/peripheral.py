@@ -148,7 +148,7 @@ class Peripheral:
                 await asyncio.wait_for(self._news.wait(), _LOOK_SECONDS)
 
     async def _look(self) -> None:
-        """Advertise or not, with the address of the node's present life; drop who has no session."""
+        """Start or stop advertising, with the node's present address; drop connections without a session."""
         factory = self._node.in_factory_state()
         if self._address.look(factory=factory):
             await self._stop_advertising()

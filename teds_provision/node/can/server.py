@@ -75,7 +75,7 @@ class EndpointTable:
                 endpoint.claim.hear(source)
 
     def speaks(self, endpoint: CanEndpoint, identifier: int) -> None:
-        """Pass a leaving frame of an endpoint to the others of this process, which hear it as one of the bus."""
+        """Pass a sent frame of an endpoint to the others of this process, as if received from the bus."""
         source = identifier & 0xFF
         if source not in endpoint.spoken_from:
             endpoint.spoken_from.add(source)
@@ -417,7 +417,7 @@ class CanServer:
     def _run_request(self, state: StationState, pair: Pair, request: EndpointRequest) -> None:
         """Run one request in its station's queue; VirtualNode lets one command run at a time.
 
-        The reply goes out from the address that was asked.
+        The reply is sent from the address of the request.
         """
         try:
             reply = state.answer(request)

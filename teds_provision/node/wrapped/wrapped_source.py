@@ -1,4 +1,4 @@
-"""The source of a wrapped node's values: what its reader heard last, by the node's clock."""
+"""The source of a wrapped node's values: the latest ones from its reader, by the node's clock."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """JSON and base64url as signed data needs them: one reading, or none (RFC 8259, RFC 4648, RFC 7515 section 2).
 
 Readers that disagree about a duplicate name, a padded string or a spare bit are how signed documents get two meanings.
-Everything here either reads one way or raises :class:`BadDataError`; nothing else comes out, whatever the octets.
+Any input either has exactly one reading or raises :class:`BadDataError`.
 """
 
 from __future__ import annotations

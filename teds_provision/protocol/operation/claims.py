@@ -1,4 +1,4 @@
-"""Who claims what: leases, dead-men, safe states (operation.md sections 1 and 2). Node, RAM only.
+"""Claims of channels: leases, dead-men, safe states (operation.md sections 1 and 2). For the node, in RAM only.
 
 A claim belongs to a session. Times here are real ns (the node's monotonic time, which a simulation's ticks need not
 follow): a dead station must silence the node however its ticks run.

@@ -1,6 +1,6 @@
 """Which pages of a station count: one history, or the part of two that they share (contract/plant.md section 2).
 
-A function of the set of signed pages that are here, in whatever order they came.
+The result depends only on the set of signed pages, not on their order of arrival.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def hash_of(octets: bytes) -> str:
 
 
 def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: DocumentKind) -> SignedDocument:
-    """Check who signed a document and read its members; the caller checks their values.
+    """Verify a document's signature and read its members; the caller checks their values.
 
     ``find_key`` gives the point of a fingerprint that may sign this kind. Raises NotAuthenticError (no known signer),
     BadDataError (no such document), NewerFormatError.
@@ -286,7 +286,7 @@ class MemberRequest:
 
 
 def open_request(octets: bytes) -> MemberRequest:
-    """Read a request, which its own key signed; who that is, a person compares.
+    """Read a request, which is signed with its own key; an operator must compare the fingerprint.
 
     Raises NotAuthenticError, BadDataError.
     """

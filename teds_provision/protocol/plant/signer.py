@@ -28,7 +28,7 @@ class SignerVerdict(NamedTuple):
 
 
 def missing_pages(whose: str, reporter: str, n: int, here: int) -> str:
-    """Return whose pages are missing, who reports which one, and the number of the last one here."""
+    """Return a message about missing pages: their author, the reporting station, and the last page here."""
     return f"pages of {whose} are missing here: {reporter} names page {n}, and the last one here is {here}"
 
 

@@ -55,7 +55,7 @@ class Staging:
             raise CommandRefusedError(Reason.BUSY)
 
     def put(self, session: NodeSession, block: BlockId, image: bytes, now: float) -> None:
-        """Stage an image; what another session had there goes."""
+        """Stage an image; staged images of another session are dropped."""
         if session is not self._owner:
             self._owner, self._images = session, {}
         self._images[block], self._touched_at = image, now

@@ -81,7 +81,7 @@ class Claims:
         """Remove everything that was folded of a chain, to fold it again."""
         with self._store.together():
             self._store.execute("INSERT OR IGNORE INTO to_judge SELECT uuid FROM claims WHERE chain = ?", (chain,))
-            self._store.execute(  # what it lifted may count again
+            self._store.execute(  # bans that this chain had lifted may count again
                 "INSERT OR IGNORE INTO to_judge SELECT uuid FROM statements WHERE lifts = 0 AND uuid IS NOT NULL"
                 " AND hash IN (SELECT hash FROM statements WHERE chain = ? AND lifts = 1)",
                 (chain,),

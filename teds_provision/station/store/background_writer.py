@@ -25,7 +25,7 @@ class BackgroundWriter:
         self._thread: threading.Thread | None = None
 
     def submit(self, step: Step) -> None:
-        """Have a step taken, after the one before it; the run's own thread goes on meanwhile.
+        """Queue a step, to run after the previous one; the run's thread continues meanwhile.
 
         Not inside a transaction: the step needs the store for itself.
         """

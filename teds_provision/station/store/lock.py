@@ -194,7 +194,7 @@ class UsageLock(_HeldFile):
         os.ftruncate(descriptor, 0)
 
     def share(self) -> None:
-        """Go on holding it, beside others who share it; who wants it alone still finds it taken."""
+        """Turn the exclusive lock into a shared one; exclusive requests are still refused."""
         assert self._descriptor is not None, "share() inside the with"
         lock(self._descriptor, shared=True, wait=True)
         self._shared = True
@@ -206,7 +206,7 @@ class UsageLock(_HeldFile):
 
     @property
     def holder(self) -> str | None:
-        """Who holds it now, in words; None if it is free."""
+        """Return a description of the holder; None if it is free."""
         return _held_by(self._path)
 
     @property

@@ -349,7 +349,7 @@ _NUMERIC: Final = ("si:real", "si:realListXMLList", "si:constant")
 def _numeric(node: Node) -> Node | None:
     """Return the D-SI element with numbers, of several units side by side one that is known here.
 
-    One that states an uncertainty goes before others.
+    One with an uncertainty is preferred.
     """
     found = node.children_named(*_NUMERIC, "si:hybrid")
     if len(found) > 1:
