@@ -1,4 +1,4 @@
-"""How much of a file is read: the limits of every reader in one place, stated in docs/formats.md.
+"""The limits of every reader of files in one place, listed in docs/formats.md.
 
 Untrusted input is checked cheaply (octets, tags, brackets, depth) before anything is built from it, so that no file
 costs more than 10 s and 300 MB. Every check raises BadDataError that names the excess and the limit. This module is

@@ -42,7 +42,7 @@ def context_of(clear: dict[str, Any], form: str) -> bytes:
 
 @dataclass(frozen=True)
 class BackupHead:
-    """Whose backup it is: store id, station's point (65 octets), name, time, keystore (its kind, as it was called).
+    """The owner of a backup: store id, station's point (65 octets), name, time, keystore (its kind, as it was called).
 
     ``material`` is all that the vault keeps secret; for a token, only what it has sealed.
     """

@@ -15,7 +15,7 @@ OPERATION_PAGE: Final = "operation.md"
 
 
 class Stage(Enum):
-    """When a rule is run, in this order. From AGREEMENT on the key changes, but in KEYED and SESSION with one held."""
+    """Stages of a check, in order. From AGREEMENT on the key changes, but in KEYED and SESSION with one held."""
 
     PLAIN = "in any state, changes nothing"
     FACTORY = "in factory state, changes nothing"

@@ -1,4 +1,4 @@
-"""Which rules are run when, and what is made durable: a run that is cut leaves no node whose key is lost."""
+"""Runs the rules in stages, and makes keys durable: after an interrupted run, no node's key is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an optional room changes a command of the core: options and examples that it gains, and what is done with them.
+"""Lets an optional room extend a command of the core: with options, examples, and their handling.
 
 A room registers a function by the command's name (``extends`` of its ``ROOM``). The function is given the command when
 it is first used, and changes it with what is here. The options of a room that is absent do not exist.

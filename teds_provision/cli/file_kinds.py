@@ -1,4 +1,4 @@
-"""Which kind of file a person gave to a command that takes another kind: one line more in its error.
+"""Recognizes the kind of a file that was given to the wrong command, for one more line in the error.
 
 A file is recognized by its first octets alone, and only kinds that are easily confused are known. A recognized kind
 decides nothing: the command has failed already.

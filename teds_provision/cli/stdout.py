@@ -84,7 +84,7 @@ def guard() -> GuardedOutput | None:
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a run is for, as far as lost output matters.
+    """Purpose of a run, which decides if lost output is an error.
 
     ``only_shows``: it shows what is there and changes nothing. ``must_print``: without its output it has failed.
     """

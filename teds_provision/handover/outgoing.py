@@ -68,7 +68,7 @@ Chosen = list[LeavingNode]
 
 
 class Selection:
-    """Which nodes go, by the tables as they are now (read once, a chunk at a time: there may be ten thousand)."""
+    """Selects nodes to export from the present tables (read once, a chunk at a time: there may be ten thousand)."""
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
         self.order, self.receivers = order, receivers

@@ -1,4 +1,4 @@
-"""Whose keys count here: stations and CAs, added after a look at the fingerprint (profile.md, "Keys and trust")."""
+"""Trusted keys: of stations and CAs, added after comparing the fingerprint (profile.md, "Keys and trust")."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ LEAST: Final = 1.0
 MOST: Final = 30.0
 """Seconds between questions while a node is missing: they double from the first to the second."""
 LOOK: Final = 0.05
-"""Seconds between looks at who waits."""
+"""Seconds between checks for waiting threads."""
 ROUND: Final = 20.0
 """Seconds that one round of a :class:`PolledDiscovery` may take, with a connection to each node."""
 

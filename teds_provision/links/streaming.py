@@ -46,7 +46,7 @@ class StreamPieces(Protocol):
 
 
 class Airtime(Protocol):
-    """How much of a link the data messages of a node take (operation.md sections 4 and 6)."""
+    """The share of a link that the data messages of a node use (operation.md sections 4 and 6)."""
 
     @property
     def most_octets(self) -> int:

@@ -139,7 +139,7 @@ class GroupRows:
 
 @dataclass(frozen=True)
 class InvalidValues:
-    """So many values of a channel that are not valid, and why, as half a sentence."""
+    """A count of invalid values of a channel, with the reason as half a sentence."""
 
     channel: int
     why: str
@@ -156,7 +156,7 @@ def why_invalid(found: Sequence[InvalidValues]) -> str:
 
 @dataclass(frozen=True)
 class NodeReport:
-    """How one node does; once a second, and when its state changes."""
+    """State and counts of one node; sent once a second, and when its state changes."""
 
     uuid: str
     state: State

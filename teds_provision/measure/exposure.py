@@ -1,4 +1,4 @@
-"""Which addresses a server of values may listen on: loopback, and others only with TLS and a name that was allowed."""
+"""Checks the addresses of servers of values: loopback; others only with TLS and a permitted name."""
 
 from __future__ import annotations
 

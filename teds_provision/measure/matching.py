@@ -143,7 +143,7 @@ def known_nodes(station: Station, expression: str) -> list[bytes]:
 
 @dataclass(frozen=True)
 class MatchSurvey:
-    """Which known nodes an expression means now (UUIDs in hex), and why the others are not measured by it."""
+    """The known nodes that an expression matches now (UUIDs in hex), and why others are not measured."""
 
     matching: tuple[str, ...]
     others: Mapping[str, str]

@@ -52,7 +52,7 @@ class ReceivedStream:
     _came: deque[tuple[bytes, int]] = field(default_factory=deque)
     _since: float = 0.0
     _order: threading.RLock = field(default_factory=threading.RLock)
-    """Held from the taking of messages to their handing on: who ends the stream may do that beside the thread."""
+    """Held while messages are taken and passed on: the thread that ends the stream does that too."""
 
     def __post_init__(self) -> None:
         plan = self.receiver.plan
@@ -172,7 +172,7 @@ class HearingThread:
         self._looks = 0
         self.lost_frames = 0
         self.failure: LinkError | None = None
-        """Why the link itself cannot be heard now; None if it can."""
+        """The present failure of the link; None if it works."""
         self._thread = threading.Thread(target=self._run, name=f"hearing {port.place}", daemon=True)
         self._thread.start()
 

@@ -16,7 +16,7 @@ from teds_provision.station.store.records import KeptMeasurement
 
 
 class Phase(Enum):
-    """How far a measurement is; ``SELECTING``: a frozen expression has not selected a node yet."""
+    """The phase of a measurement; ``SELECTING``: a frozen expression has not selected a node yet."""
 
     SELECTING = "selecting"
     LOCKING = "locking"

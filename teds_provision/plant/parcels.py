@@ -39,7 +39,7 @@ NODES: Final = 10_000
 """So many nodes go into one copy."""
 DAYS: Final = 7
 _DAYS_OF_A_LINE: Final = 31
-"""So long a request or an answer waits here: no registry keeps one longer."""
+"""Time for which a request or an answer is kept here: registries keep none longer."""
 _COMMAND: Final = "registry sync"
 _KEPT: Final = 64
 """Limit of parcels of one sender that wait here for an operator; the others stay in the registry."""
@@ -55,7 +55,7 @@ Views = Callable[[Sequence[bytes]], Mapping[bytes, MergedClaims]]
 
 @dataclass(frozen=True)
 class ParcelCounts:
-    """How many parcels of a sync were dealt with, and how many wait for a person."""
+    """Numbers of parcels of a sync: handled ones, and those that wait for the operator."""
 
     taken: int
     waiting: int

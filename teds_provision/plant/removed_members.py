@@ -25,7 +25,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeyRecord
 
 OTHERS: Final = timedelta(hours=24)
-"""So long the station whose turn it is has to rotate a key, before others do."""
+"""Time for the station whose turn it is to rotate a key, before others do it."""
 EVERY: Final = timedelta(hours=1)
 _PAGE: Final = 500
 _COMMAND: Final = "registry sync"

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 EVERY: Final = 60.0
 """Seconds between two syncs without a notification."""
 MOST_SHOWN: Final = 20
-"""Nodes in one answer to who holds a node."""
+"""Most nodes in one answer about holders."""
 _SOON: Final = 1.0
 """Seconds to wait after a failure of the connection that listens, and at most for the end of this."""
 _BUSY: Final = 2.0

@@ -214,7 +214,7 @@ def send_job(station: Station, transport: Transport, job: Job) -> None:
 
 
 class Office(Protocol):
-    """How requests reach an office, and answers come back."""
+    """Sends requests to an office, and receives its answers."""
 
     def request_signature(self, request: SignRequest) -> bytes | None:
         """Return the answer to a request, None if none came in time; a repetition is the same request."""

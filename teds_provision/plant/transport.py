@@ -1,4 +1,4 @@
-"""How pages, rosters and parcels travel: a folder (a stick, a share), or PostgreSQL. The transport is untrusted.
+"""Transports for pages, rosters and parcels: a folder (a removable disk, a share), or PostgreSQL. All are untrusted.
 
 A carrier can withhold, repeat and add junk, and no more: it gives octets, and every reader checks who signed them. So a
 transport never raises because of its content; it raises LinkError if it cannot be reached and PolicyError if it denies

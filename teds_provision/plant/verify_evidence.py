@@ -159,7 +159,7 @@ class JudgedEvidence:
 
 @dataclass
 class EvidenceTotals:
-    """How many files came to which word; ``exit_code`` is that of the worst."""
+    """Numbers of files by verdict; ``exit_code`` is that of the worst."""
 
     files: int = 0
     words: dict[str, int] = field(default_factory=dict)

@@ -85,7 +85,7 @@ def is_announce(identifier: int) -> bool:
 
 @dataclass
 class ButtonPresses:
-    """How often a node may announce that its button was pressed: once a second, 20 a minute; monotonic seconds."""
+    """Limits the Announces of button presses: once a second, 20 a minute; times in monotonic seconds."""
 
     _sent: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_A_MINUTE))
 

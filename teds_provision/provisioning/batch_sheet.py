@@ -616,7 +616,7 @@ _STYLE: Final = (
 
 @dataclass(frozen=True)
 class ReportHead:
-    """Who made a report: the station with its key (64 hex digits), the operator, and with which software."""
+    """The origin of a report: the station with its key (64 hex digits), the operator, and the software."""
 
     station: str
     fingerprint: str

@@ -1,4 +1,4 @@
-"""Which firmware a node reports, if its type accepts it, and how it is found (profile.md, "About and Locate").
+"""The firmware that a node reports, the check against its type, and Locate (profile.md, "About and Locate").
 
 A report is read once per session. In a session it is a statement by the holder of the node's key, outside one a hint,
 which may refuse and never permit. It does not affect the verdict, which covers only the datasheet.

@@ -129,7 +129,7 @@ def _state(node: dict[str, Any]) -> str | None:
 
 @dataclass(frozen=True)
 class NodeFit:
-    """How one channel of one node (None: the node as a whole) meets one requirement."""
+    """Result for one channel of one node (None: the node as a whole) and one requirement."""
 
     uuid: bytes
     requirement: Requirement

@@ -33,7 +33,7 @@ LARGEST_IMAGE = 4 << 20
 _NOISY_READS = 4
 _REFUSED_READS = 2
 READING_SECONDS = 300.0
-"""A whole image takes seconds, over a slow link a minute; who dawdles longer holds others up."""
+"""A whole image takes seconds, over a slow link a minute; a slower node would delay others."""
 
 
 def read_block(node: Conversation, block: BlockId, *, until: float | None = None) -> bytes:

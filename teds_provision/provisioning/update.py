@@ -96,7 +96,7 @@ class UpdatePlan:
 
 @dataclass(frozen=True)
 class BoardUpdate:
-    """How the update of one board ended. ``before`` is the version that ran, None if it is not known."""
+    """Result of the update of one board. ``before`` is the version that ran, None if it is not known."""
 
     uuid: bytes
     result: Result

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class PinLookup(Protocol):
-    """Which key a UUID is pinned to."""
+    """Looks up the key to which a UUID is pinned."""
 
     def check(self, uuid: bytes, point: bytes) -> None:
         """Raise KeyMismatchError if this UUID is known with another key."""

@@ -60,7 +60,7 @@ class FileVerdict:
 
 @dataclass
 class VerdictTotals:
-    """How many files came to which verdict; ``exit_code`` is that of the worst."""
+    """Numbers of files by verdict; ``exit_code`` is that of the worst."""
 
     files: int = 0
     verdicts: dict[str, int] = field(default_factory=dict)

@@ -19,7 +19,7 @@ Origin = Literal["session", "kept", "plain"]
 SESSION: Final = "session"
 """The check that the TEDS came from the node."""
 PAGES: Final = "pages"
-"""The check that this station has every page of the plant that says who signed."""
+"""The check that this station has every page of the plant that is needed to judge the signer."""
 FRESHNESS: Final = frozenset({"sequence", "key epoch"})
 MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
 """Checks that fail if the only fault is a missing signature."""

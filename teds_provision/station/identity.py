@@ -1,4 +1,4 @@
-"""Who this base station is: its name, its key, its owner's CA, and the signatures of CAs over station keys."""
+"""The identity of this station: its name, its key, its owner's CA, and the signatures of CAs over station keys."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ _UNVERIFIED_OF = (
 
 @dataclass(frozen=True)
 class Search:
-    """Which nodes are meant; every field that is set has to fit.
+    """Criteria for nodes; a node must meet all fields that are set.
 
     ``text``: any part of UUID, name or profile; ``state``: a number of Identify, ``moved``, ``revoked``, ``retired`` or
     ``unseen``; ``due``: the day (ISO 8601) by which a calibration ends; ``since``: seen at this moment or later.

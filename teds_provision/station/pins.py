@@ -1,4 +1,4 @@
-"""Which identity key a UUID is pinned to, and which nodes are on the whitelist: the one place that decides it."""
+"""Pins (the identity key of each UUID) and the whitelist of nodes; decided only here."""
 
 from __future__ import annotations
 

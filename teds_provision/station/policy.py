@@ -1,4 +1,4 @@
-"""Who and what counts here: trusted stations and CAs, the deny list, nodes given away, and the rules upon them."""
+"""The trust policy: trusted stations and CAs, the deny list, nodes given away, and the rules for them."""
 
 from __future__ import annotations
 

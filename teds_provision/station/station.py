@@ -556,7 +556,7 @@ def initialise(
 
 @dataclass(frozen=True)
 class RewrapResult:
-    """How many keys are wrapped under the new master key, and how many no master key opened (they stay as they are)."""
+    """Numbers of keys: wrapped under the new master key, and damaged (no master key opens them; left unchanged)."""
 
     keys: int
     damaged: int

@@ -35,7 +35,7 @@ def split_channel(text: str) -> tuple[int | None, str]:
 
 @dataclass(frozen=True)
 class CertificateChoice:
-    """How a certificate is to be read: for which channel, which item, whose signatures are trusted (PEM)."""
+    """Choices for reading a certificate: the channel, the item, and the trusted signers (PEM)."""
 
     channel: int | None = None
     item: str | None = None

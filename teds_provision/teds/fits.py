@@ -109,7 +109,7 @@ class Requirement:
 
 @dataclass(frozen=True)
 class Fit:
-    """How one channel meets one requirement; ``why`` names every bound that is not met, or what it has."""
+    """Result for one channel and one requirement; ``why`` lists the bounds that are not met, or the values."""
 
     channel: int | None
     name: str

@@ -121,7 +121,7 @@ def user_at(line: socket.socket) -> int:
 # dump. Its time goes on while the machine sleeps.
 
 _LOOK_SECONDS: Final = 20.0
-"""A sleeping machine stops the wait, not the clock: so often it is looked at again."""
+"""Seconds between checks of the clock: a wait stops while the machine sleeps, the clock does not."""
 _CLIENT_SECONDS: Final = 2.0
 
 

@@ -1,4 +1,4 @@
-"""Which vault a station has: chosen once at ``init``, opened once per process."""
+"""Chooses a station's vault once, at ``init``, and opens it once per process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of a Bluetooth adapter data messages take."""
+"""The share of a Bluetooth adapter's time that data messages use."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 _GONE_SECONDS: Final = 3.0
 """A node that has been silent for so long has left."""
 _SILENCE_SECONDS: Final = 0.055
-"""Nodes answer after up to 50 ms; one that is later is heard in the next round."""
+"""Nodes answer within 50 ms; a later one is found in the next round."""
 _UNCLEAR_SECONDS: Final = 0.1
 """Seconds to wait for a node whose answer was torn.
 

@@ -1,4 +1,4 @@
-"""How long a frame occupies the wire, to the bit: for benchmarks on a simulated bus (option ``pace=1``).
+"""The exact wire time of frames, for benchmarks on a simulated bus (option ``pace=1``).
 
 Frame fields, bit stuffing and the CRC-15 polynomial 0x4599 are those of ISO 11898-1. An FD frame is sent with bit
 rate switching; its stuff bits are counted over the fields in front of the CRC, the CRC's own are fixed ones.
@@ -107,7 +107,7 @@ class Pacer:
 
 
 class Wire:
-    """Until when a simulated bus is taken, for all processes of this user that pace their frames on it.
+    """The time until which a simulated bus is occupied, shared by this user's processes with paced frames on it.
 
     A small file by the bus's name, gone with its last user.
     """

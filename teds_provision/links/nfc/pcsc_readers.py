@@ -1,4 +1,4 @@
-"""Which readers the PC/SC service has; nothing of nfcpy is needed to list them."""
+"""Lists the readers of the PC/SC service, without nfcpy."""
 
 from __future__ import annotations
 

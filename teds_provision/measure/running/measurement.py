@@ -58,7 +58,7 @@ class Watcher:
 
 @dataclass(frozen=True)
 class MeasurementEnd:
-    """How a measurement ended: the ``end`` event of ``measure --json``, and the worst error, None for none."""
+    """The end of a measurement: the ``end`` event of ``measure --json``, and the worst error, None for none."""
 
     nodes: list[dict[str, Any]]
     files: list[str]

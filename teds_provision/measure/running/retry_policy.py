@@ -1,4 +1,4 @@
-"""How long a node is tried again after an error, and which errors no second try cures."""
+"""Decides how long a node is retried after an error, and which errors are final."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FINAL = (NotAuthenticError, PolicyError, BadDataError, StoreError, InternalErro
 
 
 class RetryPolicy:
-    """Until its first value a node has ``timeout`` seconds (None: no end), from then on there is no end."""
+    """Retries a node for ``timeout`` seconds (None: without limit) until its first value, and then without limit."""
 
     def __init__(self, timeout: float | None) -> None:
         self._until = math.inf if timeout is None else time.monotonic() + timeout

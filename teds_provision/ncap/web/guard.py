@@ -57,7 +57,7 @@ HEADERS: Final = (
 
 @dataclass(frozen=True)
 class Caller:
-    """Who calls: by the Unix socket (the user himself), with a browser's cookie, or with a script's token."""
+    """The caller of a request: the user over the Unix socket, a browser with its cookie, or a script with its token."""
 
     name: str
     kind: Literal["socket", "browser", "script"]

@@ -1,4 +1,4 @@
-"""Who may call: tokens of scripts and of browsers, kept as SHA-256 in ``ncap-tokens.json`` (mode 0600).
+"""Permitted callers: tokens of scripts and of browsers, kept as SHA-256 in ``ncap-tokens.json`` (mode 0600).
 
 A token is 32 random octets, so its digest needs no salt and no slow hash. The file is changed under its own lock, and
 read again when it has changed: `ncap token` works with and without a running daemon.

@@ -101,7 +101,7 @@ def written_unit(text: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class SampleChoice:
-    """How a raw number travels: the profile's sample, and the calibration that turns it into the value.
+    """The form of samples of a raw number: the profile's sample, and the calibration that turns it into the value.
 
     ``raw`` samples keep the raw number, increased by ``shift``; others hold the value in SI units as a float.
     """

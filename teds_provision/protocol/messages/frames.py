@@ -52,7 +52,7 @@ class TedsFunction(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why a node refused: the u8 of a reply with status 0 (profile.md, "Reasons")."""
+    """Reasons of refusals: the u8 of a reply with status 0 (profile.md, "Reasons")."""
 
     UNKNOWN_COMMAND = 1
     WRONG_STATE = 2
@@ -146,7 +146,7 @@ def security_command(function: Function, payload: bytes = b"") -> Command:
 
 
 IDENTIFY: Final = security_command(Function.IDENTIFY)
-"""128.7: who are you. Changes nothing, so it is asked of everyone, and whenever it is not clear who is there."""
+"""128.7: requests the node's identity. Changes nothing; used for broadcasts, and to find out which node answers."""
 
 
 def query_teds(channel: int, access_code: int) -> Command:

@@ -27,7 +27,7 @@ NONE: Final = 0xFFFFFFFF
 
 
 class StreamKind(IntEnum):
-    """How a stream samples: at even times; one message an event; or even, by the sensor's own clock."""
+    """Kinds of sampling of a stream: periodic; one message per event; or periodic by the sensor's own clock."""
 
     PERIODIC = 0
     EVENT = 1

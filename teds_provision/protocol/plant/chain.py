@@ -1,4 +1,4 @@
-"""Which pages of a station count: one history, or the part of two that they share (contract/plant.md section 2).
+"""Computes which pages of a station count: its history, or the common part of two (contract/plant.md section 2).
 
 The result depends only on the set of signed pages, not on their order of arrival.
 """

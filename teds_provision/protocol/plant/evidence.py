@@ -293,7 +293,7 @@ class CheckedEvidence:
 
 
 class Signatures(NamedTuple):
-    """Which signatures of a document hold; None: not asked for."""
+    """Results of verifying a document's signatures; None: not verified."""
 
     envelope: bool
     node_key: bool

@@ -39,7 +39,7 @@ Rule = Literal["none", "one", "list", "any"]
 
 @dataclass(frozen=True)
 class CalibrationRule:
-    """Which calibration a board gets, by SHA-256 of its file.
+    """The rule for a board's calibration, by SHA-256 of its file.
 
     ``none``: no calibration; ``one``: this one for all; ``list``: by board; ``any``: whichever is at most so many days
     old.

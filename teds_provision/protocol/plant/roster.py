@@ -70,7 +70,7 @@ class RemovedMember:
 
 @dataclass(frozen=True)
 class Share:
-    """Whose keys go to whom by themselves: all nodes, those of a group, or those of a profile."""
+    """A rule for automatic copies of keys: of all nodes, those of a group, or those of a profile."""
 
     what: tuple[Literal["all", "group", "profile"], str]
     to: tuple[str, ...]

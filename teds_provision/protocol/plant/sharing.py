@@ -1,4 +1,4 @@
-"""Whose keys go to whom by themselves, and which come in without a question (contract/plant.md section 4). Pure.
+"""Decides which keys are copied to which stations, and which are accepted (contract/plant.md section 4). Pure.
 
 A copy makes no new key, and only who made a key shares it: so nothing goes round in circles.
 """
@@ -16,7 +16,7 @@ from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.roster import Roster, Share
 
 SILENT: Final = timedelta(days=7)
-"""Who made no page for so long is not waited for: another holder shares in its place."""
+"""A station without a page for so long is not waited for: another holder shares in its place."""
 
 
 def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:

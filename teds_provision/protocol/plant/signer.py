@@ -1,4 +1,4 @@
-"""Whose signature under a datasheet counts (contract/plant.md section 1, "verify").
+"""Decides if a signer's datasheets count (contract/plant.md section 1, "verify").
 
 Being certified by the owner's CA is not enough in a plant: the roster lists who may sign, and for a station that may no
 longer, the pages list what was signed before.

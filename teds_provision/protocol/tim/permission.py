@@ -1,4 +1,4 @@
-"""Which command may be run when: the table of profile.md, "Which command when", and what claims forbid (operation.md).
+"""Permission of commands: the table of profile.md, "Which command when", and the limits during claims (operation.md).
 
 The first question that a node asks of a command; lengths and everything else come after it.
 """

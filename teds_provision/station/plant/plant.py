@@ -80,7 +80,7 @@ _DIGEST_OCTETS: Final = 32  # a TEDS is longer than a digest
 
 @dataclass(frozen=True)
 class SignerRules:
-    """Whose signature under a datasheet counts in the plant, at one moment; ``words`` looks one digest up.
+    """The plant's rules for signers of datasheets, at one moment; ``words`` looks one digest up.
 
     Plain data but for that: a list of 100,000 nodes never holds all digests, and other processes can judge by it.
     """

@@ -56,7 +56,7 @@ def by_token(name: str) -> str:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """Who did what to which node, when, and how it ended; ``hash`` is 64 hex digits."""
+    """One entry: actor, act, node, time and outcome; ``hash`` is 64 hex digits."""
 
     seq: int
     at: str
@@ -75,7 +75,7 @@ class AuditEntry:
 
 @dataclass(frozen=True)
 class AuditFilter:
-    """Which entries are meant; every field that is set has to fit."""
+    """Criteria for entries; an entry must meet all fields that are set."""
 
     uuid: bytes | None = None
     act: str | None = None

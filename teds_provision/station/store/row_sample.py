@@ -1,4 +1,4 @@
-"""Which rows of a large table a check reads: the newest and some at random, so that its time does not grow with them.
+"""Samples of large tables for checks: the newest rows and some at random, so that the time of a check does not grow.
 
 Nothing here counts or reads a whole large table. A row of a node with a key, or of a table with numbers, that another
 program changed is found with a probability of half of ``SAMPLED / n`` at least by each run; other rows as their keys

@@ -37,7 +37,7 @@ MALFORMED_CODES: Final = frozenset({"not-closed", "too-short", "too-large", "too
 
 
 class Conformity(StrEnum):
-    """How far octets follow the standard; framed TEDS, bare data blocks and messages are distinguished."""
+    """The degree to which octets follow the standard; framed TEDS, bare data blocks and messages are distinguished."""
 
     CLEAN = "clean"
     FRAME_BAD = "frame-bad"

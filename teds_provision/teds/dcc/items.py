@@ -1,4 +1,4 @@
-"""Which result of a certificate calibrates a channel, and the calibration that comes of it.
+"""Chooses the result of a certificate that calibrates a channel, and makes the calibration.
 
 A certificate may hold several results that could be meant: two quantities, the state as found beside the state as left.
 An item is one of them. Items that fit a channel are found by unit; if more than one fits, the caller chooses.

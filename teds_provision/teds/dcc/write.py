@@ -44,7 +44,7 @@ class QuantityCondition:
 
 @dataclass(frozen=True)
 class Laboratory:
-    """Who calibrated what, as the file of ``--laboratory`` states it; "" for what it does not state."""
+    """Facts about the calibration from the file of ``--laboratory``; "" for those that it lacks."""
 
     laboratory: str = ""
     country: str = ""

@@ -14,7 +14,7 @@ from typing import Final
 
 
 class KeyKind(Enum):
-    """How a value is written in the profile (docs/profiles.md, "Units and times")."""
+    """Forms of values in a profile (docs/profiles.md, "Units and times")."""
 
     TIME = "time"
     """Seconds, or a text like "100 us"."""
