@@ -12,7 +12,7 @@ from typing import Any
 import click
 import pytest
 
-from teds_provision.cli.config_file import Defaults, anchored
+from teds_provision.cli.config_file import Defaults, anchored, brokers_of
 from teds_provision.cli.main import cli
 
 from .shell import call, clean_environment
@@ -195,11 +195,47 @@ def test_a_setting_is_written_beside_the_others_and_removed_again(home: Path) ->
         ("provision.watch", "perhaps"),
         ("home", "/tmp"),
         ("can", "can0"),
+        ("can", '["socketcan:can0", "can1"]'),
+        ("timeout", "[5]"),
+        ("measure.rate", "[1, 2]"),
     ],
 )
 def test_a_setting_that_no_command_takes_is_not_written(home: Path, name: str, value: str) -> None:
     assert call(home, "config", "set", name, value).code == 2
     assert not (home / "config.toml").exists()
+
+
+def test_several_values_are_one_setting_of_the_commands_that_take_several(home: Path) -> None:
+    buses = '["socketcan:can0", "socketcan:can1"]'
+    assert call(home, "config", "set", "can", buses).code == 0
+    assert (home / "config.toml").read_text() == f"can = {buses}\n"
+    assert call(home, "config", "show").code == 0
+    (home / "config.toml").write_text("[measure]\nrate = [1, 2]\n")
+    done = call(home, "config", "show")
+    assert done.code == 8
+    assert "measure.rate takes one value, not 2" in done.err
+
+
+def test_a_broker_keeps_the_name_that_it_was_given(home: Path) -> None:
+    """An option may be written with ``_`` or ``-``; a request names a broker, letter by letter."""
+    brokers = {"plant_1": "mqtts://one", "plant-1": "mqtts://two", "a+b": "mqtts://three"}
+    for name, url in brokers.items():
+        assert call(home, "config", "set", f"ncap.brokers.{name}", url).code == 0
+    assert brokers_of(home / "config.toml") == brokers
+    assert call(home, "config", "unset", "ncap.brokers.plant_1").code == 0
+    del brokers["plant_1"]
+    assert brokers_of(home / "config.toml") == brokers
+
+
+def test_settings_may_come_before_the_station(tmp_path: Path) -> None:
+    home = tmp_path / "below" / "new"
+    assert call(home, "--json", "config", "unset", "nfc").json["removed"] is None
+    assert not home.exists()
+    assert call(home, "config", "set", "nfc", "usb").code == 0
+    assert home.stat().st_mode & 0o777 == 0o700
+    made = call(home, "init", "--keystore", "file")
+    assert made.code == 0, made.err
+    assert [setting["value"] for setting in call(home, "--json", "config", "show").json["settings"]][1:] == ["usb"]
 
 
 def test_a_file_that_says_it_otherwise_is_left_to_its_owner(home: Path) -> None:

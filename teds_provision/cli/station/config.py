@@ -13,6 +13,7 @@ import click
 
 from teds_provision.cli import shell_completion
 from teds_provision.cli.config_file import (
+    BROKERS,
     anchored,
     config_path,
     parameter_of,
@@ -28,9 +29,12 @@ from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.limits import load_toml
 from teds_provision.links.can import spec
+from teds_provision.station.store.database import prepare_home
 from teds_provision.station.store.lock import StoreLock
 
 _PREFIX = "TEDS_PROVISION_"
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+"""Names that TOML takes without quotes."""
 
 
 @click.group(
@@ -105,12 +109,14 @@ def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
 
 def _check_value(root: click.Context, name: str, value: Any, place: Path) -> None:
     """Have click read a value as the command would; raises BadDataError."""
-    found = _parameter(root, name)
+    found = _parameter(root, name, several=isinstance(value, list))
     if found is None:
         return
     path, command, option = found
     if option.multiple and not isinstance(value, list):
         value = [value]
+    if isinstance(value, list) and not option.multiple:
+        raise BadDataError(f"{place}: {name} takes one value, not {len(value)}.", hint="Fix that line.")
     try:
         option.process_value(click.Context(command, parent=root, info_name=path), value)
     except click.BadParameter as error:
@@ -118,14 +124,25 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
         raise BadDataError(f"{place}: {name} = {value!r}: {reason}.", hint="Fix that line.") from error
 
 
-def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, click.Parameter] | None:
-    """Return the first command that a setting serves, with its path and the option; None for a broker."""
+def _parameter(
+    root: click.Context, name: str, *, several: bool = False
+) -> tuple[str, click.Command, click.Option] | None:
+    """Return the first command that a setting serves, with its path and the option; None for a broker.
+
+    ``several``: prefer a command that takes several values of it.
+    """
     *words, option = name.replace("_", "-").split(".")
+    found = None
     for path, options in OPTIONS.items():
-        if option in options and path.split()[: len(words)] == words:
-            command, wanted = _command(root, path), parameter_of(path, option)
-            return next(((path, command, parameter) for parameter in command.params if parameter.name == wanted), None)
-    return None
+        if option not in options or path.split()[: len(words)] != words:
+            continue
+        command, wanted = _command(root, path), parameter_of(path, option)
+        for parameter in command.params:
+            if parameter.name == wanted and isinstance(parameter, click.Option):
+                found = found or (path, command, parameter)
+                if parameter.multiple or not several:
+                    return path, command, parameter
+    return found
 
 
 def _command(root: click.Context, path: str) -> click.Command:
@@ -196,17 +213,23 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
         nested = {word: nested}
     for problem in problems(nested, ""):
         raise UsageError(f"{name}: {problem.partition(': ')[2]}", hint="See docs/configuration.md.")
-    parameter = _parameter(root, name)
-    if listed is not None or parameter is None:  # a list, or the URL of a broker
+    parameter = _parameter(root, name, several=listed is not None)
+    if parameter is None:  # the URL of a broker
         return value if listed is None else listed
     path, command, option_ = parameter
+    if listed is not None and not option_.multiple:
+        raise UsageError(f"{name} takes one value, not {len(listed)}.")
+    given = [value] if listed is None else listed
     try:
-        given = [value] if option_.multiple else value
-        read = option_.process_value(click.Context(command, parent=root, info_name=path), given)
+        context = click.Context(command, parent=root, info_name=path)
+        read = option_.process_value(context, given if option_.multiple else value)
     except click.BadParameter as error:
         raise UsageError(f"{name}: {error.message.rstrip('.')}.") from error
     if option_.name == "can":
-        spec.parse_spec(value)  # a wrong value would make every command fail
+        for bus in given:
+            spec.parse_spec(bus)  # a wrong value would make every command fail
+    if listed is not None:
+        return listed
     return read if isinstance(read, bool | int | float) else value
 
 
@@ -231,7 +254,14 @@ def _edit(app: App, command: str, name: str, value: Any) -> bool:
     only if it has exactly the wanted content. Otherwise raises BadDataError, with nothing changed.
     """
     place = config_path(app.home)
-    *table, key = name.replace("_", "-").split(".")
+    *table, key = name.split(".")
+    table = [word.replace("_", "-") for word in table]
+    if " ".join(table) != BROKERS:
+        key = key.replace("_", "-")
+    if value is not None:
+        prepare_home(app.home, create=True)  # a setting may come before init
+    elif not place.exists():
+        return False
     with StoreLock(app.home, command=command, notice=app.note):
         text = read_config_text(place) or ""
         wanted = _plain(load_toml(text, str(place)))
@@ -258,8 +288,10 @@ def _edited(text: str, table: list[str], key: str, value: Any) -> str:
     lines = text.splitlines()
     there = _lines_of(lines, table)
     start, end = there or (len(lines), len(lines))
+    pattern = re.escape(key) if " ".join(table) == BROKERS else re.escape(key).replace(r"\-", "[-_]")
+    line = f"{key if _BARE.fullmatch(key) else to_json(key)} = {_toml(value)}"
     for number in range(start, end):
-        found = re.match(rf"(\s*(['\"]?){key.replace('-', '[-_]')}\2\s*=\s*)(.*)", lines[number])
+        found = re.match(rf"(\s*(['\"]?){pattern}\2\s*=\s*)(.*)", lines[number])
         if found is None:
             continue
         if value is None:
@@ -270,11 +302,11 @@ def _edited(text: str, table: list[str], key: str, value: Any) -> str:
     if value is None:
         return text
     if there is None:
-        lines += [*([""] if lines else []), f"[{'.'.join(table)}]", f"{key} = {_toml(value)}"]
+        lines += [*([""] if lines else []), f"[{'.'.join(table)}]", line]
         return "\n".join([*lines, ""])
     set_lines = [n for n in range(start, end) if lines[n].strip() and not lines[n].lstrip().startswith("#")]
     first = next((n for n in range(start, end) if not lines[n].startswith("#")), end) if not table else start
-    lines.insert(set_lines[-1] + 1 if set_lines else first, f"{key} = {_toml(value)}")
+    lines.insert(set_lines[-1] + 1 if set_lines else first, line)
     return "\n".join([*lines, ""])
 
 
@@ -306,11 +338,13 @@ def _toml(value: Any) -> str:
     return str(value) if isinstance(value, int | float) and not isinstance(value, bool) else to_json(value)
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings with dashes in all names, so that both spellings are one setting."""
-    return {
-        name.replace("_", "-"): _plain(value) if isinstance(value, dict) else value for name, value in values.items()
-    }
+def _plain(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Return the settings with dashes in all names, so that both spellings are one setting; brokers keep theirs."""
+    plain = {}
+    for name, value in values.items():
+        key = name if above == BROKERS else name.replace("_", "-")
+        plain[key] = _plain(value, f"{above} {key}".strip()) if isinstance(value, dict) else value
+    return plain
 
 
 def _pruned(values: dict[str, Any]) -> dict[str, Any]:
