@@ -79,8 +79,10 @@ class ClockMap:
         self.lie = ""
         self._own = own_drift
         self._rate = (own_drift + NODE_DRIFT) / 1e6  # growth of uncertainty, in ns per ns of age
-        # The last EXCHANGES, oldest first. Plain numbers save memory: a station has these for each of its nodes.
-        self._ticks, self._offsets, self._errors = array("q"), array("d"), array("d")
+        # The last EXCHANGES. Plain numbers save memory: a station has these for each of its nodes.
+        self._ticks = array("q", [0]) * EXCHANGES  # as long from the start as they ever are
+        self._offsets, self._errors = array("d", [0.0]) * EXCHANGES, array("d", [0.0]) * EXCHANGES
+        self._exchanges = 0  # how many there were; each goes into the place of the oldest
         self._hull = LowerHull()
         # bounds that follow from the evidence, at tick `_when`
         self._low, self._high, self._when = -math.inf, math.inf, 0
@@ -130,10 +132,9 @@ class ClockMap:
         return False
 
     def _keep(self, exchange: Exchange) -> None:
-        self._ticks.append(exchange.tick)
-        self._offsets.append(exchange.offset)
-        self._errors.append(exchange.error)
-        del self._ticks[:-EXCHANGES], self._offsets[:-EXCHANGES], self._errors[:-EXCHANGES]
+        place = self._exchanges % EXCHANGES
+        self._ticks[place], self._offsets[place], self._errors[place] = exchange.tick, exchange.offset, exchange.error
+        self._exchanges += 1
 
     def arrival(self, tick: int, host: int) -> None:
         """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
@@ -221,7 +222,7 @@ class ClockMap:
 
     def _refit(self, tick: int) -> None:
         before = self._line(tick) if self._handed_out else None
-        offset, skew = self._by_exchanges(tick) if self._ticks else self._by_arrivals(tick)
+        offset, skew = self._by_exchanges(tick) if self._exchanges else self._by_arrivals(tick)
         low, high = self._limits(tick)
         self._origin, self._offset, self._skew = tick, float(min(max(offset, low), high)), skew
         self._residue, self._refitted = 0.0 if before is None else before - self._offset, tick
@@ -236,9 +237,10 @@ class ClockMap:
 
         Plain numbers: arrays of another size after each exchange stay in the C library's cache of each node's thread.
         """
-        at = [float(moment - tick) for moment in self._ticks]
-        base, errors = self._offsets[-1], self._errors
-        offsets = [offset - base for offset in self._offsets]
+        kept = min(self._exchanges, EXCHANGES)
+        base, errors = self._offsets[(self._exchanges - 1) % EXCHANGES], self._errors[:kept]
+        at = [float(moment - tick) for moment in self._ticks[:kept]]
+        offsets = [offset - base for offset in self._offsets[:kept]]
         best, span = min(errors), max(at) - min(at)
         edge, skew = self._by_arrivals(tick)
         if len(at) >= 4 and span >= SPAN_OF_EXCHANGES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import sys
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -312,3 +313,15 @@ def test_a_clock_that_is_followed_anew_is_apart_from_the_systems_no_more(monkeyp
     assert host.was_set()
     assert host.set_anew() == pytest.approx(100.0)
     assert host.apart == 0.0
+
+
+def test_the_exchanges_of_a_clock_take_their_memory_at_once() -> None:
+    node, clock = Node(20.0), ClockMap()
+
+    def octets() -> int:
+        return sum(sys.getsizeof(column) for column in (clock._ticks, clock._offsets, clock._errors))
+
+    before = octets()
+    for number in range(2 * EXCHANGES):
+        assert clock.exchange(node.exchange(BOOT + (1 + number) * SECOND)), clock.lie
+    assert octets() == before < 2000
