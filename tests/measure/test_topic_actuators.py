@@ -166,3 +166,17 @@ def test_after_a_lost_reply_one_clock_settles_that_no_value_is_on_its_way(monkey
     scene.actuators.close()
     assert (scene.actuators.refused, len(scene.applied)) == (1, 2)
     assert [command == CLOCK for command in asked] == [False, False, True, False, False, False]
+
+
+def test_a_run_of_drive_that_was_used_before_is_refused() -> None:
+    """Its messages would be sealed a second time under one key, with counters that begin again."""
+    runs = iter([1, 1, 2])
+    scene = Scene(lambda: reply(next(runs)))
+    scene.give(3 * WATCHED)
+    sent, [actuator] = len(scene.messages), scene.actuators._actuators.values()
+    assert sent > WATCHED
+    actuator.driver = None  # as after another actuator of the node had a set point
+    scene.give(WATCHED)
+    assert (len(scene.messages), scene.node.asked) == (sent, 2)
+    assert "no Drive messages" in scene.warnings[0]
+    scene.actuators.close()

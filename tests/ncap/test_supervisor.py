@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
 from teds_provision import client
-from teds_provision.errors import NodeBusyError, NoNodeError, StoreError
+from teds_provision.errors import NodeBusyError, NoNodeError, PolicyError, StoreError
 from teds_provision.links.discovery import Sighting
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.buses import Buses
@@ -160,9 +160,9 @@ def test_two_writers_of_one_node_wait_for_each_other_and_those_of_others_do_not(
     assert service.measurements.lent_for(NODE) == "let go for write"
 
 
-def lending(service: Service, *commands: str) -> list[AsyncIterator[Any]]:
+def lending(service: Service, *commands: str, updates: object = None) -> list[AsyncIterator[Any]]:
     """Ask for the one node as commands of this home do; returns the lines of each answer."""
-    resources = Resources(SimpleNamespace(measuring=service.measurements))  # type: ignore[arg-type]
+    resources = Resources(SimpleNamespace(measuring=service.measurements, updates=updates))  # type: ignore[arg-type]
     answers = []
     for command in commands:
         scope = {"type": "http", "path_params": {"uuid": NODE}, "query_string": f"for={command}".encode()}
@@ -281,3 +281,27 @@ def test_the_log_has_what_a_deleted_measurement_counted(service: Service) -> Non
     service.measurements.delete("1")
     *_, ended = entries(service, "measure")
     assert (ended.outcome, ended.detail) == ("ended", {"id": "1", "owner": "ncap", "samples": 80, "lost": 4})
+
+
+def test_a_node_whose_actuator_is_in_use_is_let_go_to_any_command_but_an_update(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The restart would end what the actuator does; another command writes after its release."""
+
+    def require_free(uuid: str) -> None:
+        assert uuid == NODE
+        raise PolicyError("Actuator 3 of the board is in use; the restart would end that.")
+
+    updates: Any = SimpleNamespace(require_free=require_free)
+
+    async def answers() -> list[str]:
+        lines = [[line async for line in until_answered(command)][-1] for command in commands]
+        for command in commands:
+            await command.aclose()  # type: ignore[attr-defined]
+        return lines
+
+    commands = lending(service, "update", "write", updates=updates)
+    assert asyncio.run(answers()) == [
+        "refused: Actuator 3 of the board is in use; the restart would end that.\n",
+        "not measured\n",
+    ]

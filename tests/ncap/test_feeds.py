@@ -1,0 +1,88 @@
+"""Virtual transducers and their simulations, without processes: who feeds one, how fast, and when one starts again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NodeBusyError, NotFoundError, UsageError
+from teds_provision.ncap.nodes import simulation, virtual
+from teds_provision.ncap.nodes.simulation import MOST_OCTETS, SIMULATION, Feed, Pace
+from teds_provision.ncap.nodes.virtual import Virtual, Virtuals
+
+ONE, OTHER = "ab" * 10, "cd" * 10
+
+
+class Bench:
+    """The virtual transducers of a station without a store; ``events`` are what clients are sent."""
+
+    def __init__(self, folder: Path) -> None:
+        self.events: list[str] = []
+        station: Any = SimpleNamespace(home=folder, audit=lambda *_words, **_facts: None)
+        live: Any = SimpleNamespace(event=lambda _kind, **facts: self.events.append(facts["state"]))
+        self.virtuals = Virtuals(station, live)
+
+    def made(self, uuid: str, name: str, folder: Path, source: str = SIMULATION) -> Virtual:
+        one = self.virtuals._all[uuid] = Virtual(uuid, name, source, folder)
+        return one
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+def test_a_transducer_has_one_simulation_and_the_end_of_an_earlier_one_is_not_the_end_of_the_next(
+    bench: Bench, tmp_path: Path
+) -> None:
+    one, first, second = bench.made(ONE, "hand", tmp_path), Feed("page", lambda: None), Feed("api:sim", lambda: None)
+    bench.virtuals.begin_feed(one, first)
+    with pytest.raises(NodeBusyError, match="already fed by page"):
+        bench.virtuals.begin_feed(one, second)
+    bench.virtuals.end_feed(one, first)
+    bench.virtuals.begin_feed(one, second)
+    bench.virtuals.end_feed(one, first)
+    assert one.feed is second
+    bench.virtuals.end_feed(one, second)
+    assert one.feed is None
+    assert bench.events == ["fed", "not fed", "fed", "not fed", "not fed"]
+    with pytest.raises(UsageError, match="has the source noise"):
+        bench.virtuals.begin_feed(bench.made(OTHER, "foot", tmp_path, "noise"), first)
+
+
+def test_a_transducer_is_named_by_its_uuid_or_by_a_name_that_only_it_has(bench: Bench, tmp_path: Path) -> None:
+    one, other = bench.made(ONE, "hand", tmp_path), bench.made(OTHER, "foot", tmp_path)
+    assert [bench.virtuals.find(text) for text in (ONE.upper(), "hand", OTHER, "foot")] == [one, one, other, other]
+    other.name = "hand"
+    assert bench.virtuals.find(OTHER) is other
+    for text in ("hand", "foot", "ef" * 10):
+        with pytest.raises(NotFoundError):
+            bench.virtuals.find(text)
+
+
+def test_a_transducer_that_was_ready_is_started_a_second_after_its_end_and_others_ever_later(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, ready = bench.made(ONE, "hand", tmp_path, "noise"), [False] * 7 + [True, False, False]
+    pauses: list[float] = []
+    monkeypatch.setattr(virtual.subprocess, "Popen", lambda *_words, **_more: SimpleNamespace(poll=lambda: 0))
+    monkeypatch.setattr(bench.virtuals, "_until_its_end", lambda _one, _process: ready.pop(0))
+    stop = SimpleNamespace(is_set=lambda: not ready, wait=pauses.append)
+    monkeypatch.setattr(bench.virtuals, "_stop", stop)
+    bench.virtuals._run(one)
+    assert pauses == [1, 2, 4, 8, 16, 30, 30, 1, 2], "at most half a minute"
+
+
+def test_a_simulation_may_save_up_a_quarter_of_a_second_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(simulation, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    pace = Pace()
+    assert pace.delay(MOST_OCTETS // 4) == pytest.approx(0.25)
+    now[0] += 0.25
+    assert pace.delay(MOST_OCTETS // 8) == pytest.approx(0.125)
+    now[0] += 3600.0
+    assert pace.delay(MOST_OCTETS // 4) == 0.0
+    assert pace.delay(MOST_OCTETS // 2) == pytest.approx(0.5)

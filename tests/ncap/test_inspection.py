@@ -1,0 +1,92 @@
+"""Which way a node that came is inspected: in a session, or by its plain answers; and which datasheet counts."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NotAuthenticError, PolicyError
+from teds_provision.measure import verified_session
+from teds_provision.measure.verified_session import open_unverified
+from teds_provision.ncap.nodes import inspection
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.teds.image import SECURITY, Image
+
+
+@pytest.mark.parametrize(
+    ("held", "state", "opens", "way"),
+    [
+        (True, NodeState.PROVISIONED, True, "session"),
+        (True, NodeState.KEYED, True, "session"),
+        (True, NodeState.PROVISIONED, False, "session stranger"),
+        (True, NodeState.FACTORY, True, "stranger"),
+        (False, NodeState.PROVISIONED, True, "stranger"),
+    ],
+)
+def test_a_node_is_inspected_in_a_session_if_its_key_is_held_and_it_reports_one(
+    held: bool, state: NodeState, opens: bool, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that was reset has no key: each try would cost the bus a refusal, and the node its turn."""
+    went: list[str] = []
+    found = object()
+
+    def in_session(*_words: Any) -> object | None:
+        went.append("session")
+        return found if opens else None
+
+    def stranger(*_words: Any) -> object:
+        went.append("stranger")
+        return found
+
+    monkeypatch.setattr(inspection, "_in_session", in_session)
+    monkeypatch.setattr(inspection, "_stranger", stranger)
+    monkeypatch.setattr(inspection, "identify", lambda *_words: None)
+    station: Any = SimpleNamespace(keys=SimpleNamespace(held=lambda _uuid: held))
+    node: Any = SimpleNamespace(uuid=bytes(10), identity=SimpleNamespace(state=state))
+    assert inspection.look(station, node) is found
+    assert went == way.split()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "kept", "again", "opens"),
+    [
+        ("unsigned", False, "", True),
+        ("unsigned", True, "unsigned", True),
+        ("unsigned", True, "not authentic", False),
+        ("authentic", False, "", False),
+        ("not authentic", False, "", False),
+    ],
+)
+def test_an_unsigned_datasheet_counts_only_as_it_was_read_since_the_start_of_the_node(
+    verdict: str, kept: bool, again: str, opens: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its Security TEDS names no digest of the others: one that was swapped since would calibrate the values."""
+    before, now = (Image(bytes(10), {SECURITY: octets}) for octets in (b"before", b"now"))
+    looked = SimpleNamespace(verified=SimpleNamespace(verdict=verdict), kept=kept, image=before)
+
+    def require_authentic(verified: Any) -> None:
+        raise NotAuthenticError(f"It is {verified.verdict}.")
+
+    replaced: dict[str, Any] = {
+        "require_measurable": lambda *_words: None,
+        "require_session": lambda *_words: None,
+        "verify_in_session": lambda *_words, **_more: looked,
+        "read_image": lambda _node: now,
+        "freshness_floor_of": lambda *_words: None,
+        "keep": lambda *_words, **_more: SimpleNamespace(verified=SimpleNamespace(verdict=again)),
+        "require_authentic": require_authentic,
+    }
+    for name, stands_for in replaced.items():
+        monkeypatch.setattr(verified_session, name, stands_for)
+    sheets: list[Image] = []
+    monkeypatch.setattr(verified_session, "Sheet", SimpleNamespace(from_image=sheets.append))
+    node: Any = SimpleNamespace(uuid=bytes(10), open_counter=3, proven=None)
+    none: Any = None
+    if not opens:
+        with pytest.raises((NotAuthenticError, PolicyError)):
+            open_unverified(none, node, by="ncap")
+        return
+    assert open_unverified(none, node, by="ncap").unverified
+    assert sheets == [now if kept else before]

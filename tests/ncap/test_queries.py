@@ -1,0 +1,123 @@
+"""What a request's query and headers mean, asked of the functions that read them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from starlette.requests import Request
+
+from teds_provision.errors import UsageError
+from teds_provision.ncap.web import clause12, resources
+from teds_provision.ncap.web.clause12 import Clause12
+from teds_provision.ncap.web.guard import Caller, RequestRefusedError, _require_may_change
+
+
+def request(query: str = "", *headers: tuple[str, str]) -> Request:
+    pairs = [(name.encode(), value.encode()) for name, value in headers]
+    return Request({"type": "http", "method": "GET", "path": "/", "query_string": query.encode(), "headers": pairs})
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ([], None),
+        (["*"], None),
+        (['"a1"'], {"a1"}),
+        (['"a1", "b2"'], {"a1", "b2"}),
+        (['"a1"', '"b2"'], {"a1", "b2"}),
+        (['"a1", *'], None),
+        (['W/"a1"'], set()),
+        (["a1"], set()),
+        (['"'], set()),
+        ([""], set()),
+    ],
+)
+def test_if_match_names_the_datasheets_that_may_be_changed_and_a_weak_or_bare_tag_none(
+    tags: list[str], expected: set[str] | None
+) -> None:
+    """A tag that is no strong one must refuse the change, not allow every one (RFC 9110, section 13.1.1)."""
+    assert resources._expected(request("", *(("if-match", tag) for tag in tags))) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [("", 7), ("limit=1", 1), ("limit=10", 10), ("limit=0", None), ("limit=11", None), ("limit=", None)]
+    + [(f"limit={word}", None) for word in ("-1", "1.0", "%D9%A1", "1e1", "00000000000000000000001")],
+)
+def test_a_number_is_whole_within_its_bounds_or_left_out(text: str, number: int | None) -> None:
+    if number is not None:
+        assert resources._integer(request(text), "limit", 7, 10) == number
+        return
+    with pytest.raises(UsageError, match="limit must be a whole number from 1 to 10"):
+        resources._integer(request(text), "limit", 7, 10)
+
+
+def test_a_switch_is_on_or_off_and_an_unknown_word_is_refused() -> None:
+    words = {"": False, "dry_run=1": True, "dry_run=True": True, "dry_run=0": False, "dry_run=false": False}
+    assert {text: resources._says(request(text), "dry_run") for text in words} == words
+    with pytest.raises(UsageError, match="dry_run must be 1 or 0"):
+        resources._says(request("dry_run=yes"), "dry_run")
+    resources._require_known(request("dry_run=1"), ["dry_run"])
+    with pytest.raises(UsageError, match="Unknown in the query: dry-run"):
+        resources._require_known(request("dry-run=1"), ["dry_run"])
+
+
+@pytest.mark.parametrize(
+    ("text", "moment"),
+    [
+        ("from=12.5", 12.5),
+        ("from=2026-11-22T10:00:00Z", 1795341600.0),
+        ("from=2026-11-22T11:00:00%2B01:00", 1795341600.0),
+        ("from=2026-11-22T10:00:00", 1795341600.0),
+        ("", None),
+        ("from=", None),
+    ],
+)
+def test_a_moment_is_in_unix_seconds_or_iso_and_without_a_zone_in_utc(text: str, moment: float | None) -> None:
+    assert resources._unix(request(text), "from") == moment
+
+
+def test_a_change_without_a_body_is_a_delete_of_no_octets() -> None:
+    caller = Caller("a", "script")
+
+    def refused(method: str, **headers: str) -> int | None:
+        scope = {"type": "http", "method": method, "path": "/api/v1/x"}
+        try:
+            _require_may_change(scope, {name.replace("_", "-"): value for name, value in headers.items()}, caller)
+        except RequestRefusedError as refusal:
+            return refusal.status
+        return None
+
+    json = "application/json; charset=utf-8"
+    assert [refused("DELETE"), refused("DELETE", content_length="0"), refused("GET")] == [None] * 3
+    assert refused("DELETE", content_length="2") == 415
+    assert refused("DELETE", transfer_encoding="chunked") == 415, "it has a body, of whatever form"
+    assert refused("DELETE", transfer_encoding="chunked", content_type=json) is None
+    assert [refused("POST"), refused("PUT", content_type="text/plain")] == [415, 415]
+    assert refused("POST", content_type=json) is None
+    assert refused("POST", content_type=json, content_length=str((1 << 20) + 1)) == 413
+    assert refused("GET", content_length=str((1 << 20) + 1)) == 413
+
+
+def test_names_of_clause_12_are_separated_by_commas_alone_and_a_module_keeps_its_number() -> None:
+    present = ["aa", "bb"]
+    directory = SimpleNamespace(
+        uuids=lambda: present,
+        seen=lambda uuid: SimpleNamespace(present=uuid != "cc"),
+        channel_names=lambda _uuid: [(1, "left, upper"), (2, "right")],
+    )
+    daemon: Any = SimpleNamespace(directory=directory, known=lambda word: word)
+    found = Clause12(daemon)
+    assert found.tims({})["timIds"] == "1,2"
+    present[:] = ["bb", "cc", "aa", "dd"]
+    assert found.tims({}) == {"timIds": "2,1,3", "uuids": "bb,aa,dd"}
+    assert found.transducers({"timid": "2"}) == {
+        "timId": 2, "channelIds": "1,2", "transducerNames": "left  upper,right",
+    }  # fmt: skip
+    with pytest.raises(UsageError, match="timId is missing"):
+        found.transducers({})
+    for word in ("", "-1", "65536", "x"):
+        with pytest.raises(UsageError, match="channelId must be a number"):
+            clause12._integer({"channelid": word}, "channelId")
