@@ -283,9 +283,10 @@ def test_a_mark_names_its_holder_and_shows_one_that_was_killed(tmp_path: Path) -
             pass  # the first to leave takes no name away: it may be that of one who stays
     with UsageLock(place, command="measure") as free:
         assert not free.left_behind, "whoever leaves in order puts the mark away"
-    place.write_text("{}")  # what a process leaves that was killed
+    place.write_text(f"{{{' ' * 500}}}")  # what a process leaves that was killed, of a longer name than the next one's
     with UsageLock(place, command="measure") as again:
         assert again.left_behind
+        assert "(measure)" in (again.holder or "")
 
 
 def test_of_too_many_nodes_the_one_that_was_heard_longest_ago_is_forgotten() -> None:

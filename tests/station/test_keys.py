@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from teds_provision.errors import NotFoundError, StoreError
+from teds_provision.station.node_keys import CONFIRM_MAY_ARRIVE
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Holder, KeyRecord, NodeRecord, StationRecord
 
@@ -182,6 +186,28 @@ def test_a_good_open_makes_older_keys_obsolete_and_leaves_a_newer_agreement(stat
     station.keys.promote(NODE, f"{3:016x}")
     assert [(key.epoch, key.state) for key in station.keys.keys_of(NODE)] == [(4, "pending"), (3, "active")]
     assert numbers(station, OTHER) == [2]
+
+
+@pytest.mark.parametrize(
+    ("change", "stays"),
+    [
+        ({}, True),
+        ({"epoch": 2}, False),  # the node has gone on from it: no Confirm of it can be good any more
+        ({"epoch": 1}, False),
+        ({"source": "import"}, False),
+        ({"created": CONFIRM_MAY_ARRIVE - timedelta(seconds=10)}, True),
+        ({"created": CONFIRM_MAY_ARRIVE + timedelta(seconds=10)}, False),
+    ],
+)
+def test_of_the_other_keys_only_a_newer_agreement_of_a_moment_ago_outlives_a_good_open(
+    station: Station, change: dict[str, Any], stays: bool
+) -> None:
+    if "created" in change:
+        change = {"created": (datetime.now(UTC) - change["created"]).strftime("%Y-%m-%dT%H:%M:%SZ")}
+    other = replace(a_key(3), **change)
+    station.keys.add(a_key(2, "active"), other)
+    station.keys.promote(NODE, f"{2:016x}")
+    assert [key.key_id for key in station.keys.keys_of(NODE)] == [*[other.key_id] * stays, f"{2:016x}"]
 
 
 def test_a_ca_whose_key_did_not_open_is_forgotten(station: Station) -> None:
