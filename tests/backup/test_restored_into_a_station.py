@@ -176,15 +176,20 @@ def test_states_that_went_different_ways_keep_both_sides_newest(station: Station
         place(content.copy, stale)
     shutil.copy(station.home / "vault.json", stale / "vault.json")
     add_key(station, ONE, 4)
+    station.nodes.remember(ONE, epoch=4, sequence=9)
+    station.nodes.remember(TWO, epoch=1, sequence=1)
     station.audit("agree", ONE, "done")
     back_up(station, tmp_path / "b")
     other = Station.open(stale, ask=ask)
     add_key(other, TWO, 7)
+    other.nodes.remember(TWO, epoch=7, sequence=8)
     other.audit("agree", TWO, "done")
     done = merge(other, opened(tmp_path / "b"), dry_run=False)
     assert done.relation is Relation.DIVERGED
     assert {epoch for epoch, _, _ in keys_of(other, ONE)} == {1, 4}
     assert {epoch for epoch, _, _ in keys_of(other, TWO)} == {7}
+    known = {node.uuid: (node.epoch, node.sequence) for node in other.nodes.all()}
+    assert (known[ONE], known[TWO]) == ((4, 9), (7, 8))
     assert other.audit_log.check().intact
     other.close()
 

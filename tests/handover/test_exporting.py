@@ -32,6 +32,17 @@ def test_the_same_export_again_is_the_same_handover(pair: Pair, mode: str, named
     assert close(pair.north, taken.receipt).fresh
 
 
+def test_a_move_that_is_carried_on_after_its_end_gets_a_new_one_and_a_copy_is_another_handover(pair: Pair) -> None:
+    now = datetime.now(UTC)
+    for mode in ("copy", "move"):
+        first = pair.export(mode)[1].plan  # type: ignore[arg-type]
+        order = ExportOrder(("south",), (pair.board.uuid,), mode)  # type: ignore[arg-type]
+        assert plan_export(pair.north, order, now=first.expires - timedelta(seconds=1)).expires == first.expires
+        later = plan_export(pair.north, order, now=first.expires)
+        assert (later.id == first.id) is (mode == "move")
+        assert later.expires > now + timedelta(days=13)
+
+
 def test_a_bundle_file_is_private_and_never_overwritten(pair: Pair) -> None:
     path, _ = pair.export("copy")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600

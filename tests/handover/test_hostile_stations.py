@@ -18,7 +18,14 @@ from teds_provision.files import new_file
 from teds_provision.handover.deny import lift
 from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
 from teds_provision.handover.life import revoke
-from teds_provision.handover.outgoing import ExportOrder, export_all, export_bundle, outputs_of, plan_exports
+from teds_provision.handover.outgoing import (
+    ExportOrder,
+    export_all,
+    export_bundle,
+    outputs_of,
+    plan_export,
+    plan_exports,
+)
 from teds_provision.handover.pending import close, find_handover, undo
 from teds_provision.handover.trust import plan_removal, remove
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
@@ -280,6 +287,17 @@ def test_trust_that_is_removed_ends_with_all_that_hung_on_it(pair: Pair) -> None
     assert pair.south.policy.revocation(pair.board.uuid) is None
     trust(pair.south, pair.north)
     assert pair.north.ca not in pair.south.policy.trusted_cas(pair.board.uuid)  # a person compared a station, not a CA
+
+
+def test_the_owners_ca_stays_though_a_station_that_is_trusted_no_more_brought_nodes_of_it(pair: Pair) -> None:
+    pair.take(pair.export("move")[0])
+    session(pair.south, pair.board)
+    back = pair.folder / "back.jwe"
+    export_bundle(pair.south, plan_export(pair.south, ExportOrder(("north",), (pair.board.uuid,), "move")), back)
+    pair.take(back, pair.north)
+    (south,) = pair.north.policy.trusted("station")
+    assert remove(pair.north, south).cas == ()
+    assert pair.north.policy.counts(pair.north.ca)
 
 
 def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, west: Station) -> None:

@@ -84,6 +84,20 @@ def test_an_older_epoch_than_the_stores_is_refused(pair: Pair) -> None:
         plan_import(pair.south, old.read_bytes())
 
 
+@pytest.mark.parametrize("holds", [True, False])
+def test_an_older_epoch_than_the_node_reported_is_refused_whatever_key_is_held(pair: Pair, holds: bool) -> None:
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    bundle, _ = pair.export("copy")
+    pair.south.nodes.remember(pair.board.uuid, epoch=3)
+    if not holds:
+        pair.south.keys.remove(pair.board.uuid)
+    with pytest.raises(PolicyError, match="epoch 2 is older than 3, which is known here"):
+        plan_import(pair.south, bundle.read_bytes())
+
+
 def test_an_older_epoch_than_that_of_a_key_without_proof_is_refused_with_the_way_on(pair: Pair) -> None:
     """The epoch was "known here", where nothing but the word of a bundle was; once the node was reached it is clear."""
     pair.take(pair.export("copy")[0])

@@ -18,7 +18,7 @@ from teds_provision.provisioning.inventory import inventory
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.verify import verify_image
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.station.store.records import Draft, WhitelistEntry
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session
@@ -158,8 +158,11 @@ def test_a_node_that_was_out_of_service_and_proves_that_it_was_reset_is_out_of_i
 def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
     spare = Board(uuid=bytes.fromhex("8d4d9da65281f700ffff"))
     key_up(pair.north, spare)
+    for uuid in (pair.board.uuid, spare.uuid):
+        pair.north.datasheets.keep_draft(Draft(uuid, Image(uuid, {})))
     plan = plan_takeover(pair.north, pair.board.uuid, spare.uuid, copy_calibration=False)
     take_over(pair.north, plan, None)
+    assert pair.north.datasheets.drafts() == [], "of the old node, and of the spare before it was one"
     record = pair.north.nodes.get(spare.uuid)
     assert record is not None
     assert (record.name, record.profile) == ("finger 1", "tactile-finger-sensor")

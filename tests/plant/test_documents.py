@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -173,6 +174,30 @@ def test_two_rosters_of_one_version_are_reported_and_the_next_version_cures() ->
     assert taking(a_roster(2, (NORTH, WEST), other.hash), first, first.registry)[0] == "taken, two rosters"
     assert taking(a_roster(2, (NORTH, WEST), first.hash), first, first.registry)[0] == "taken"
     assert taking(a_roster(5, (NORTH, WEST), "ab" * 32), first, first.registry)[0] == "taken"
+
+
+def test_each_of_many_rosters_is_judged_by_those_before_it() -> None:
+    own = a_roster(1, (NORTH,))
+    straight = a_roster(2, (NORTH, WEST), own.hash)
+    candidates = (a_roster(2, (NORTH, WEST), f"{number:064x}") for number in range(100))
+    astray = next(found for found in candidates if found.hash < straight.hash)
+    third = a_roster(3, (NORTH, WEST), astray.hash)
+    judged = roster.best([third, straight, astray, own], own, own.registry)
+    assert [(seen.hash, how) for seen, how, _ in judged] == [
+        (own.hash, "same"),
+        (astray.hash, "taken, two rosters"),
+        (straight.hash, "two rosters"),
+        (third.hash, "taken"),
+    ]
+
+
+def test_a_member_is_meant_before_a_removed_station_of_its_name_and_of_those_the_last() -> None:
+    first, last = (replace(left(a_member(name, "line")), name="west") for name in ("south", "office"))
+    assert a_roster(2, (NORTH, WEST), "ab" * 32, removed=(first, last)).named("west") == WEST
+    gone = a_roster(2, (NORTH,), "ab" * 32, removed=(first, last))
+    assert gone.named("west") == last
+    assert gone.named(first.fingerprint[:16].upper()) == first
+    assert gone.named(first.fingerprint[:15]) is None
 
 
 def test_no_station_leaves_a_roster_without_being_removed_and_none_comes_back() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.merged_claims import LocalState
-from teds_provision.protocol.plant.roster import Place, Roster, open_roster
+from teds_provision.protocol.plant.roster import Place, Roster, Why, open_roster
 from tests.plant.plants import NODES, NOW, Reader, Speaker, roster_of, shuffled, speaker
 from tests.plant.test_documents import CA, KAT, octets_of
 
@@ -313,7 +314,22 @@ def test_a_move_that_was_not_undone_ends_a_holder_and_a_reset_ends_all(four: lis
     assert not reader.view(A, LocalState("f" * 64, pin=PIN)).held
     assert set(reader.view(A, LocalState("f" * 64, pin=OTHER)).held) == {line.fingerprint}
     keep.page(pinned(keep, PIN))
-    assert not Reader(roster_of(four), pages_of(four)).view(A).held
+    reader = Reader(roster_of(four), pages_of(four))
+    assert not reader.view(A).held
+    assert set(reader.view(A, LocalState("f" * 64, pin=OTHER)).held) == {line.fingerprint}, "one's own pin decides here"
+
+
+def test_what_a_station_wrote_last_counts_of_one_sequence(four: list[Speaker]) -> None:
+    line = four[2]
+
+    def written(sequence: int, digest: str, profile: str) -> dict[str, Any]:
+        return line.event(
+            "written", A, epoch=1, sequence=sequence, teds_sha256=digest, profile=profile, profile_sha256=None, due=None
+        )
+
+    line.page(written(1, DIGEST, "a"), written(2, DIGEST, "b"), written(2, DIGEST, "c"), written(1, DIGEST2, "d"))
+    seen = Reader(roster_of(four), pages_of(four)).view(A)
+    assert seen.written == {line.fingerprint: (2, DIGEST, "c")}
 
 
 def test_a_keepers_name_goes_before_a_later_one(four: list[Speaker]) -> None:
@@ -344,13 +360,18 @@ def test_the_newest_report_of_a_nodes_firmware_is_shown_first_with_its_station(f
     assert firmware_seen(roster_of(four), four) == [("base", "1.3.0+0"), ("line", "1.2.0+3"), ("keep", None)]
 
 
-def test_what_a_stolen_station_saw_counts_to_its_last_page_and_after_all_others(four: list[Speaker]) -> None:
+@pytest.mark.parametrize("why", ["retired", "lost", "stolen"])
+def test_what_a_removed_station_saw_counts_to_its_last_page_and_of_a_stolen_one_after_all_others(
+    four: list[Speaker], why: Why
+) -> None:
     keep, keep2, line, base = four
     last = line.page(reported(line, OLD, 4_000_000))
     line.page(reported(line, NEW, 4_000_001))
     base.page(reported(base, NEW, 10))
     gone = roster_of([keep, keep2, base], [(line, last)], version=2)
-    assert firmware_seen(gone, four) == [("base", "1.3.0+0"), ("line", "1.2.0+3")]
+    gone = replace(gone, removed=(replace(gone.removed[0], why=why),))
+    seen = firmware_seen(gone, four)
+    assert seen == sorted([("line", "1.2.0+3"), ("base", "1.3.0+0")], reverse=why == "retired")
 
 
 def test_an_auditor_reports_no_firmware(four: list[Speaker]) -> None:
@@ -430,6 +451,21 @@ def test_a_ban_counts_from_a_keeper_and_from_who_has_the_key(four: list[Speaker]
     keep.page(keep.event("lifted", None, of=event.hash_of_statement(statement.statement)))
     own = LocalState("f" * 64, holders=frozenset({line.fingerprint}))
     assert not Reader(roster_of(four), pages_of(four)).view(A, own).bans, "a keeper lifts anybody's"
+
+
+def test_a_ban_of_ones_own_counts_here_and_who_signed_a_ban_lifts_it(four: list[Speaker]) -> None:
+    _, _, line, base = four
+    statement = seal_revocation(line.key, uuid=A, node=PIN, why="lost", created=NOW)
+    line.page(line.event("revoked", A, statement=statement.statement))
+    others = LocalState("f" * 64, holders=frozenset({line.fingerprint}))
+    lifted = event.hash_of_statement(statement.statement)
+    base.page(base.event("lifted", None, of=lifted))
+    for own in (LocalState(line.fingerprint), others):
+        assert Reader(roster_of(four), pages_of(four)).view(A, own).bans, "who is no keeper lifts no other's"
+        assert not Reader(roster_of(four), pages_of(four)).view(A, replace(own, lifted=frozenset({lifted}))).bans
+    line.page(line.event("lifted", None, of=lifted))
+    for own in (LocalState(line.fingerprint), others):
+        assert not Reader(roster_of(four), pages_of(four)).view(A, own).bans
 
 
 def test_a_removed_ones_ban_stays_from_its_own_pages_and_comes_from_no_other(four: list[Speaker]) -> None:

@@ -138,6 +138,9 @@ def test_forged_announces_move_a_node_less_and_less() -> None:
         moved = forge(claim, own, now)
         assert (moved != own) is (move < 3), "ten minutes without a conflict"
         own = moved
+    for conflict in (Announce(own, 1, 7), Announce(own, 1, 5)):  # one that the node wins is a conflict as well
+        now += 599.0
+        assert claim.handle_announce(conflict, own, now) == own
 
 
 def test_a_move_that_waits_is_none_with_an_actuator_claimed_or_once_the_address_was_set() -> None:

@@ -201,6 +201,9 @@ def test_a_repeated_about_is_run_again_and_a_repeated_locate_is_not() -> None:
     board.report = REPORT
     assert exchange(locate(5)) == exchange(locate(5))
     assert board.blinks == [5]
+    exchange(ABOUT)
+    exchange(locate(5))
+    assert board.blinks == [5, 5], "what came between takes the place of the stored reply"
 
 
 def test_presses_are_announced_once_a_second_and_twenty_a_minute() -> None:

@@ -34,10 +34,13 @@ from teds_provision.protocol.messages.smp import (
     decode_map,
     decode_packet,
 )
+from teds_provision.protocol.operation.commands import OperateCommand
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
 
 from .desk import NODE, Desk
+from .operation.bench import DIGEST as DIGEST_OF_TEDS
+from .operation.bench import SECOND, Bench
 
 DIGEST = bytes(range(32))
 SET_ADDRESS = security_command(Function.SET_CAN_ADDRESS, bytes([192]))
@@ -302,17 +305,35 @@ def test_while_an_upload_lives_nothing_of_others_disturbs_it() -> None:
 
 
 def test_an_upload_ends_when_it_is_complete_or_its_session_ends() -> None:
-    for ends in ("complete", "closed"):
+    for ends in ("complete", "closed", "another session closed"):
         desk = ManagedDesk(answer={"off": 1})
         assert desk.refuses(first(length=100)) is None
         assert desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").reason == Reason.BUSY
         if ends == "complete":
             desk.manager.answer = {"off": 100, "match": True}
             assert desk.refuses(piece(1, bytes(99))) is None
-        else:
+        elif ends == "closed":
             assert desk.sealed(security_command(Function.CLOSE), link="can:f1").ok
             desk.open(link="can:f1")
-        assert desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").ok
+        else:
+            own = desk.second_session()
+            assert desk.sealed(security_command(Function.CLOSE), link="can:f2").ok
+            desk.session = own
+        reason = desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").reason
+        assert reason == (Reason.BUSY if ends == "another session closed" else None)
+
+
+def test_a_node_that_measures_claims_nothing_while_an_upload_lives() -> None:
+    manager = Manager()
+    bench = Bench(firmware=manager, manager=manager).open().open("can:f2")
+    operate = OperateCommand(1, DIGEST_OF_TEDS, 10).command()
+    manager.answer = {"off": 1}
+    upload = security_command(Function.MANAGE, first(length=100).encode())
+    assert bench.send(upload).ok
+    assert [bench.reason(operate, link) for link in ("can:f1", "can:f2")] == [Reason.BUSY] * 2
+    bench.later(60 * SECOND)
+    assert [bench.reason(operate, link) for link in ("can:f1", "can:f2")] == [None] * 2
+    assert bench.reason(upload) == Reason.BUSY, "and no upload begins under a claim"
 
 
 def test_a_refused_piece_begins_no_upload() -> None:

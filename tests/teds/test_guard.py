@@ -152,6 +152,12 @@ def test_a_reversed_slope_is_refused_against_what_the_node_has(tactile: Profile)
     )
 
 
+def test_a_slope_that_the_uncertainty_hides_is_not_reversed(tactile: Profile) -> None:
+    steep, faint = built(tactile, force_line()), built(tactile, force_line(5, -0.004 / 65535))
+    for new, old in ((faint, steep), (steep, faint)):
+        assert "reversed" not in codes(check_calibration(new, old))
+
+
 def test_a_reversed_slope_is_refused_against_the_profile_alone(tactile: Profile) -> None:
     findings = check_calibration(built(tactile, force_line(10.0, -10 / 65535)), None, tactile)
     assert codes(findings) == {"reversed"}
@@ -161,6 +167,11 @@ def test_a_reversed_slope_is_refused_by_what_the_teds_itself_carries(tactile: Pr
     text_ = "# channel: 1\n# method: linear\n0,10\n65535,0\n"
     calibration = read_calibrations(text_, "x.csv", tactile)[1]
     assert codes(check_calibration(built(tactile, calibration))) == {"reversed"}
+
+
+def test_what_the_teds_carries_counts_beside_a_profile_that_does_not_name_the_channel(tactile: Profile) -> None:
+    turned = built(tactile, force_line(10, -10 / 65535, monotone="increasing"))
+    assert "reversed" in codes(check_calibration(turned, profile=replace(tactile, channels=())))
 
 
 def test_a_reversed_sign_is_refused(tactile: Profile) -> None:

@@ -91,6 +91,15 @@ def test_every_octet_string_reads_as_the_contract_says(form: SampleForm, data: s
     assert possible.tolist() == [math.isfinite(x) and x <= most for x in expected.tolist()]
 
 
+@pytest.mark.parametrize("bits", [0, 1, 12, 15, 16])
+def test_of_an_integer_every_number_of_its_bits_is_possible_and_none_above(bits: int) -> None:
+    reader = SampleReader(SampleForm(DataModel.UNSIGNED, 2, bits))
+    most = (1 << (bits or 16)) - 1
+    samples = [0, most, min(most + 1, 0xFFFF)]
+    possible = reader.numbers(reader.raw(b"".join(number.to_bytes(2, "big") for number in samples)))[1]
+    assert possible.tolist() == [True, True, most == 0xFFFF]
+
+
 def test_a_block_may_come_as_rows_of_a_larger_message() -> None:
     reader = SampleReader(SampleForm(DataModel.UNSIGNED, 2))
     body = np.frombuffer(bytes.fromhex("aa 0001 bb 0203 aa 0004 bb 0506"), dtype=np.uint8).reshape(-1, 6)

@@ -23,6 +23,7 @@ from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, seal, unseal
 from teds_provision.vault.selection import create_vault, open_vault
+from teds_provision.vault.software import merge_keys
 from tests.pace import costs_at_most
 from tests.passphrase_costs import product_costs
 from tests.vault.passphrase import GOOD, STORE, Person
@@ -348,6 +349,14 @@ def test_two_lives_of_one_station_are_not_called_two_stations(tmp_path: Path, va
         restored.join(newer)
     assert "another --home" in error.value.hint
     assert restored.secret_material() == before
+
+
+def test_of_two_ca_keys_the_one_that_is_here_stays() -> None:
+    here = Material.generate()
+    other = here.with_ca(SoftwareKey.generate().secret())
+    assert merge_keys(here, other.encode()) == here
+    assert merge_keys(here.with_ca(None), other.encode()) == other
+    assert merge_keys(here, other.with_ca(None).encode()) == here
 
 
 def test_an_older_backup_brings_back_old_master_keys_without_losing_the_new(tmp_path: Path, vault: FileVault) -> None:

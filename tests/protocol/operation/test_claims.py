@@ -110,6 +110,17 @@ def test_whatever_ends_a_claim_brings_the_actuator_to_its_safe_state(end: str) -
     assert not bench.tim.actuator_claimed()
 
 
+@pytest.mark.parametrize("channel", [1, 4, 5])
+def test_every_claim_ends_if_power_is_too_low_to_measure(channel: int) -> None:
+    bench = Bench().open("can:f1").open("can:f2").operate(channel, link="can:f2")
+    bench.hardware.charge = PowerReply(PowerFlag.BATTERY)
+    bench.tim.poll()
+    assert bench.operation().measuring
+    bench.hardware.charge = PowerReply(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
+    bench.tim.poll()
+    assert not bench.operation().measuring
+
+
 @pytest.mark.parametrize("value", ["3.2", "Set"])
 def test_the_dead_man_lives_by_values_for_this_channel_alone(value: str) -> None:
     bench = Bench().open().operate(4, 6, dead_man=200)

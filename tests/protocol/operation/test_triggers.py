@@ -67,11 +67,13 @@ def test_one_trigger_per_action_and_life_0_disarms_that_action() -> None:
 
 def test_what_is_armed_goes_with_the_last_claim() -> None:
     bench = Bench().open().operate(1, 2)
-    token = armed(bench, Action.MARK)
+    first, second = armed(bench, Action.START), armed(bench, Action.MARK)
     bench.idle(1)
+    bench.tim.trigger("can:f1", first.octets, 5)
+    assert clock(bench).mark == 5, "another claim is left, and whatever the action it is the session's mark"
     bench.idle(2)
-    bench.tim.trigger("can:f1", token.octets, 5)
-    assert clock(bench).mark == 0
+    bench.tim.trigger("can:f1", second.octets, 6)
+    assert clock(bench).mark == 5
 
 
 def test_a_stop_trigger_brings_every_actuator_of_the_session_to_its_safe_state() -> None:
