@@ -375,3 +375,16 @@ def test_of_a_batch_the_message_that_came_soonest_after_its_samples_is_told_to_t
     ReceivedStream._note_arrival(heard, came, messages)
     ReceivedStream._note_arrival(heard, came, messages[:2])
     assert told == [(630, 1_090), (630, 1_210)]
+
+
+def test_a_period_of_less_than_half_or_more_than_twice_the_asked_one_is_a_gap_or_a_fault() -> None:
+    """A sensor that stood still for a second would date what comes next as if it took a second for each sample."""
+    interpreter = Scene(StreamKind.FREE).heard.interpreter
+    real = []
+    for index, tick in enumerate(
+        (0, MS, 3 * MS, 3 * MS + MS // 2, 6 * MS, 6 * MS + MS // 4, 6 * MS + MS // 4 + 9 * MS // 10)
+    ):
+        message: Any = SimpleNamespace(index=index, tick=SECOND + tick)
+        interpreter._spaced(message, 3)
+        real.append(interpreter._real)
+    assert real == [MS, MS, 2 * MS, MS / 2, MS / 2, MS / 2, 9 * MS / 10]

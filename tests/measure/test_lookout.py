@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from teds_provision.errors import AddressConflictError, NodeRefusedError, NoNode
 from teds_provision.links.can.link import conflict
 from teds_provision.links.discovery import PolledDiscovery, Sighting
 from teds_provision.links.ports import Contact
+from teds_provision.measure import request
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.presence import MOST, TWIN, Presence
 from teds_provision.measure.request import Requirements
@@ -327,3 +329,29 @@ def test_of_two_places_the_one_that_answered_last_is_tried(order: tuple[int, int
     last = sightings.seen_at(ONE)
     assert last is not None
     assert (last.address, [sighting.address for sighting in sightings.all()]) == (9, [9])
+
+
+def test_datasheets_are_waited_for_from_the_first_one_on_however_many_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If one of ten never comes, the last of the others would wait ten times as long."""
+    now = [100.0]
+    monkeypatch.setattr(request, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    class Turn:
+        def __enter__(self) -> None:
+            pass
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def notify_all(self) -> None:
+            pass
+
+        def wait(self, seconds: float) -> None:
+            now[0] += seconds
+
+    requirements = Requirements((), waiting=10.0)
+    monkeypatch.setattr(requirements, "_turn", Turn())
+    requirements.expect([ONE, TWO, THREE])
+    for uuid in (ONE, TWO):
+        requirements.offer(uuid, sheet(uuid), threading.Event())
+        assert now[0] == pytest.approx(110.0)

@@ -54,6 +54,15 @@ def test_if_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None:
     assert len(left) == 3
 
 
+def test_a_place_is_not_taken_from_who_would_then_have_fewer() -> None:
+    """Two tokens would take one place from each other for ever, each time with a new connection."""
+    places, left = LiveSlots(most=3, of_one=3), list[str]()
+    for token in ("a", "a", "b"):
+        assert places.acquire(token, lambda token=token: left.append(token))
+    assert not places.acquire("b", lambda: None)
+    assert left == []
+
+
 def test_a_token_that_is_over_is_good_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tokens = Tokens(tmp_path)
     cookie = tokens.login(tokens.login_link().rpartition("=")[2])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from mcap.reader import make_reader
 
 from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import Block, GroupRows, InvalidValues, NodeReport, Note
+from teds_provision.measure.recordings import converting
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.recordings.summary import RecordingSummary
@@ -230,3 +233,22 @@ def test_more_nodes_than_an_octet_counts_keep_their_samples_apart(tmp_path: Path
     assert {key: [raw for _, raw, _ in pairs] for key, pairs in found.items()} == {
         (uuid, 1): [number] for number, uuid in enumerate(uuids)
     }
+
+
+def test_rows_of_a_grid_are_made_as_the_recording_is_read_although_a_stream_has_ended() -> None:
+    """Else all that comes after the last value of a node that was lost waits in memory for the end of the file."""
+    recording: Any = SimpleNamespace(facts={ANGLE.key: ANGLE, FORCE.key: FORCE}, station=STATION)
+    taken, begun = [0], list[int]()
+
+    def entries() -> Iterator[Any]:
+        yield block(uuid=HAND, channels=(2,))
+        for second in range(60):
+            taken[0] = second
+            yield block(start=STATION.started + second)
+            yield ()
+
+    for rows in converting._gridded(entries(), recording):
+        assert isinstance(rows, GroupRows)
+        begun.append(taken[0])
+    assert begun[-1] == 59
+    assert set(range(7, 60)) <= set(begun), "five seconds, and two periods, after its last value"

@@ -27,7 +27,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError, TedsProvisionError, UsageError
-from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
@@ -277,12 +277,13 @@ def test_a_node_that_is_tried_again_gets_one_line_until_something_changes(tmp_pa
     other = refused("TEDS 3 of channel 1 has another digest; again in 8 s")
     tries = [refused(f"the station is not trusted; again in {pause} s") for pause in (1, 2, 4, 8)]
     back = NodeReport(ARM, "running", time=1_795_000_050.0)
-    record(path, [block(), *tries, other, back, tries[0], tries[1]])
+    record(path, [block(), *tries, other, tries[0], back, tries[1], tries[2]])
     lines = [line for line in path.read_text().splitlines() if line.startswith("# ") and " refused: " in line]
     assert [line.partition("; ")[2] for line in lines] == [
         "the station is not trusted; again in 1 s",
         "TEDS 3 of channel 1 has another digest; again in 8 s",
         "the station is not trusted; again in 1 s",
+        "the station is not trusted; again in 2 s",  # it ran meanwhile
     ]
 
 
@@ -651,3 +652,31 @@ def test_of_what_a_full_disk_took_in_part_the_whole_pieces_stay(
     assert ((tmp_path / "run.csv").read_bytes(), part.size) == (b"head\none\n", 9)
     part.add(b"four\n", 3)
     assert part.abandon() == 7, "what was cut off, and what waits"
+
+
+def test_another_datasheet_in_an_mcap_has_topics_with_its_own_units(tmp_path: Path) -> None:
+    """A reader takes unit and calibration of a value from the metadata of the topic that the value is on."""
+    path = tmp_path / "run.mcap"
+    degrees = replace(ANGLE, unit="degree", fingerprint="ef" * 32)
+    record(path, [block(index=0), [degrees], block(index=3)])
+    units: dict[str, list[str]] = {}
+    with path.open("rb") as file:
+        for _, channel, _ in make_reader(file).iter_messages():
+            known = channel.metadata
+            if "unit" in known or "channels" in known:
+                unit = known["unit"] if "unit" in known else json.loads(known["channels"])[0]["unit"]
+                units.setdefault(channel.topic, []).append(unit)
+    assert units == dict.fromkeys(("/bench/arm/angle", "/bench/arm/stream_0"), ["rad"] * 3 + ["degree"] * 3)
+
+
+def test_a_wide_file_of_another_datasheet_is_a_part_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    sink = open_sink(f"wide:{path}")
+    sink.open([ANGLE], STATION)
+    for facts in ([ANGLE], [ANGLE], [replace(ANGLE, fingerprint="ef" * 32)]):
+        sink.describe(facts)
+        value = np.array([[1.0], [2.0]])
+        sink.write_group(GroupRows("crane", (ANGLE.key,), np.array([0.0, 1.0]) + 1_795_000_000.0, value, 0 * value))
+    sink.close()
+    assert sink.files == (str(path), str(tmp_path / "run.2.csv"))
+    assert [len(rows(Path(name).read_text())) for name in sink.files] == [4, 2]

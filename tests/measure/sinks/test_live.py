@@ -357,6 +357,8 @@ def test_sensors_alone_are_no_joint_and_their_owner_is_not_guessed() -> None:
     joints = joints_of([*gripper(), second], topics)
     assert [(joint.actuator, dict(joint.state)) for joint in joints] == [(1, {}), (4, {})]
     assert len({joint.name for joint in joints}) == 2
+    twice = [*gripper(), replace(gripper()[1], number=5, name="opening, coarse")]
+    assert [dict(joint.state) for joint in joints_of(twice, topics)] == [{"effort": 3}], "which of them is not known"
 
 
 def test_the_datasheet_is_on_a_topic_whole() -> None:

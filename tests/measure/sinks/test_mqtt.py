@@ -401,3 +401,19 @@ def test_a_password_file_that_is_not_there_is_reported(tmp_path: Path) -> None:
     sink = open_sink(f"mqtt://user@127.0.0.1:1?password-file={tmp_path}/none")
     with pytest.raises(TedsProvisionError, match="password-file="):
         sink.open([ANGLE], STATION)
+
+
+def test_under_another_name_of_their_node_all_channels_are_announced_anew_and_its_old_state_goes() -> None:
+    other = replace(ANGLE, number=2, name="other")
+    sink, client = desk_sink(ANGLE, other)
+    sink._process_item((ANGLE, other))
+    first = [topic for topic, _ in client.published]
+    assert first == [f"homeassistant/sensor/{ARM}/{number}/config" for number in (1, 2)]
+    client.published.clear()
+    sink._process_item((ANGLE, other))
+    assert client.published == [], "nothing is new"
+    sink._process_item((replace(ANGLE, chosen=((0, "left"),)),))
+    topics = [topic for topic, _ in client.published]
+    assert topics == ["bench/arm/state", *first]
+    assert client.published[0][1] == b""
+    assert [json.loads(octets)["state_topic"] for _, octets in client.published[1:]] == ["bench/left"] * 2
