@@ -5,7 +5,8 @@
 `ncap run --measure all --mqtt` as a user starts it, a mosquitto on loopback. Memory is that of the station's process
 (resident, and proportional: pages that it shares with others count in part), once all nodes run and have been read
 whole; processor time is that of the next ``--seconds``. 200 nodes send 8.1 values a second each, others ``--rate``.
-``--soak``: the first of these sizes runs so long, and a line is drawn through its memory.
+``--soak``: the first of these sizes runs so long, and a line is drawn through its memory, of a long soak through that
+of its second quarter of an hour and what follows.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from teds_provision.links.ports import free_port
 A_BUS = 200  # nodes
 SIZES = [20, 200, 1000]
 CPU_NODES, CPU_RATE, CPU_AIM = 200, 8.1, 0.3  # 1,620 values a second; cores
-GROWTH, GROWTH_OF_A_NODE = 1.0, 0.02  # aims, MB an hour: the page's hour of each channel fills in the first one
+GROWTH = 1.0  # aim, MB an hour
+FILLING = 900.0  # seconds in which the bins of the last minute fill, and each thread's stack reaches its depth
 _PATIENCE = 600.0
 
 
@@ -142,15 +144,23 @@ def soaked(rows: Rows, here: client.Client, pid: int, count: int, seconds: float
     while (now := time.monotonic() - began) < seconds:
         points.append((now / 3600, memory(pid)[0]))
         time.sleep(min(5.0, seconds / 20))
-    hours, megabytes = zip(*points, strict=True)
-    middle, level = sum(hours) / len(points), sum(megabytes) / len(points)
-    slope = sum((at - middle) * (each - level) for at, each in points) / sum((at - middle) ** 2 for at in hours)
+    late = [point for point in points if point[0] * 3600 >= FILLING] if seconds >= 2 * FILLING else points
+    text = f"  {seconds / 60:.0f} minutes with {count} nodes: growth"
     rows.add(
-        f"  {seconds / 60:.0f} minutes with {count} nodes: growth", slope, "MB/h", aim=GROWTH + GROWTH_OF_A_NODE * count
+        f"{text} after the first {FILLING / 60:.0f}" if late is not points else text, slope(late), "MB/h", aim=GROWTH
     )
+    megabytes = [each for _, each in points]
     rows.add("  from", megabytes[0], "MB")
+    rows.add("  when the line begins", late[0][1], "MB")
     rows.add("  to", megabytes[-1], "MB")
     rows.add("  lost, late or bad since the start", samples(here)[1], "")
+
+
+def slope(points: list[tuple[float, float]]) -> float:
+    """Return the slope of the line of least squares through points."""
+    middle, level = (sum(column) / len(points) for column in zip(*points, strict=True))
+    rise = sum((at - middle) * (each - level) for at, each in points)
+    return float(rise / sum((at - middle) ** 2 for at, _ in points))
 
 
 def main(words: list[str] | None = None) -> None:
