@@ -20,7 +20,7 @@ SIGNATURE_OCTETS = 64
 CHALLENGE_OCTETS = 32
 # Order of the group P-256, SP 800-186 table 1.
 GROUP_ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
-_HALF_ORDER = GROUP_ORDER // 2
+_ZERO, _ORDER, _HALF = (number.to_bytes(32, "big") for number in (0, GROUP_ORDER, GROUP_ORDER // 2))
 
 
 class PrivateKey(Protocol):
@@ -147,16 +147,31 @@ def verify_once(point: bytes, message: bytes, signature: bytes) -> bool:
 
 
 def _holds(load: Callable[[bytes], ec.EllipticCurvePublicKey], point: bytes, message: bytes, signature: bytes) -> bool:
-    if len(signature) != SIGNATURE_OCTETS:
-        return False
-    r, s = int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big")
-    if not 0 < r < GROUP_ORDER or not 0 < s <= _HALF_ORDER:
+    der = _to_der(signature)
+    if der is None:
         return False
     try:
-        load(point).verify(utils.encode_dss_signature(r, s), hashlib.sha256(message).digest(), _of_digest())
+        load(point).verify(der, hashlib.sha256(message).digest(), _of_digest())
     except (exceptions.InvalidSignature, BadDataError):
         return False
     return True
+
+
+def _to_der(signature: bytes) -> bytes | None:
+    """Return r ‖ s in DER; None if it is not 64 octets long, or r or s is out of its range (a high s too).
+
+    Numbers of one length compare as octets do. Most r and s have no leading zeros, and are put together here: the
+    library takes 0.6 µs longer for them.
+    """
+    r, s = signature[:32], signature[32:]
+    if len(signature) != SIGNATURE_OCTETS or not _ZERO < r < _ORDER or not _ZERO < s <= _HALF:
+        return None
+    if s[0]:  # below 0x80, as s is in the lower half
+        if r[0] > 0x7F:
+            return b"\x30\x45\x02\x21\0" + r + b"\x02\x20" + s
+        if r[0]:
+            return b"\x30\x44\x02\x20" + r + b"\x02\x20" + s
+    return utils.encode_dss_signature(int.from_bytes(r, "big"), int.from_bytes(s, "big"))
 
 
 def verify_der(point: bytes, message: bytes, signature: bytes) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
 
 from teds_provision.protocol import keys
 from teds_provision.protocol.datasheet import SignedNodeKey, sign_datasheet, unsigned_datasheet
@@ -51,6 +52,17 @@ def test_a_high_s_is_refused() -> None:
     forged = signature[:32] + high.to_bytes(32, "big")
     assert not keys.verify(key("node").point, octets("prove", "message"), forged)
     assert keys.normalise_signature(forged) == signature
+
+
+_EDGES = (0, 1, 127, 128, 1 << 247, (1 << 248) - 1, 1 << 248, 1 << 255, keys.GROUP_ORDER // 2, keys.GROUP_ORDER)
+
+
+@pytest.mark.parametrize("r", [*_EDGES, keys.GROUP_ORDER - 1, (1 << 256) - 1])
+@pytest.mark.parametrize("s", [*_EDGES, keys.GROUP_ORDER // 2 + 1, (1 << 255) - 1])
+def test_a_signature_goes_to_the_library_as_it_spells_it_itself(r: int, s: int) -> None:
+    spelled = keys._to_der(r.to_bytes(32, "big") + s.to_bytes(32, "big"))
+    good = 0 < r < keys.GROUP_ORDER and 0 < s <= keys.GROUP_ORDER // 2
+    assert spelled == (encode_dss_signature(r, s) if good else None)
 
 
 def test_the_default_can_address_follows_from_the_uuid() -> None:
