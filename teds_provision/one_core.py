@@ -165,7 +165,7 @@ class OneCore:
                 self.core = found
 
     def _others(self) -> dict[int, float]:
-        """Return the share of each core that others took since the last look."""
+        """Return the share of each core that other processes used since the last call."""
         busy, own, now = self._kernel.busy(), self._kernel.own(), self._kernel.now()
         seconds = max(now - self._since, 1e-3)
         mine = (own - self._own) / seconds

@@ -1,8 +1,8 @@
-"""The rooms that the program works without, and the one interface through which they add what they have.
+"""Optional rooms, without which the program works, and the interface through which they extend it.
 
 An optional room is a folder of the package above all others: it may import every room, and none imports it. Its module
 ``room.py`` has ``ROOM``, an :class:`OptionalRoom`, which names what the room adds, each as ``"module:attribute"`` below
-the room. Nothing of that is imported before it is used. The core asks for it in three places:
+the room. Nothing of that is imported before it is used. The core uses it in three places:
 
 ====================  ==============================================================================================
 ``sections``          its commands and their lines in ``--help`` (``cli/table.py``)

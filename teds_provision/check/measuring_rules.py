@@ -122,7 +122,7 @@ def _kind(state: ChannelState) -> ChannelKind:
 
 
 def _fits(probe: Probe, channel: int, kind: ChannelKind, digest: bytes) -> bool:
-    """Ask with a lease of 0, which is looked at after the TEDS and before any claim: 6 if it does not fit, else 19."""
+    """Send Operate with a lease of 0, checked after the TEDS and before any claim: 6 on a mismatch, else 19."""
     acting = kind is ChannelKind.ACTUATOR
     reply = probe.sealed(OperateCommand(channel, digest, 0, 0 if acting else None).command())
     if reply.ok:  # the rule operate-lease reports this

@@ -414,7 +414,7 @@ def _free_address(probe: Probe, home: int) -> int:
 
 
 def _moved(probe: Probe, home: int, target: int) -> StationSession:
-    """Have the address set and ask the node there from now on; the session that did it, as it was."""
+    """Set the address, and address the node there from now on; return the session that did it."""
     session = probe.session or probe.open()
     try:
         reply = probe.sealed(_set_address(target))

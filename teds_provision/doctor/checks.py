@@ -1,8 +1,8 @@
 """``doctor``: named checks of this machine, its links and the station, each with its cause and the cure.
 
 A check is a function from a :class:`System` to findings, registered under a name. It opens no reader and no bus unless
-the user named one, changes nothing, and looks at the system below ``System.root`` only, so that tests can show it a
-machine with any hardware.
+the user named one, changes nothing, and reads the system's files only below ``System.root``, so that tests can
+simulate a machine with any hardware.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Python's search for objects that hold each other, put off while ten thousand rows are made."""
+"""Pause the garbage collector while ten thousand rows are made."""
 
 from __future__ import annotations
 

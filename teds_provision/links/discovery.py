@@ -1,8 +1,8 @@
-"""Finding nodes on a link for all waiting threads: one thread asks for all of them.
+"""Finds nodes on a link for all waiting threads, in one thread.
 
-Fifty threads that look for fifty nodes would each ask the whole bus; so one discovery asks for all. It asks at its
-start, when a node is missing (at once, once more, then after 1 s, doubling to 30 s), and every ``poll`` seconds if
-requested (operation.md section 7). Its results are hints: a session proves identity.
+Fifty threads that search for fifty nodes would each send broadcasts; instead, one discovery does it for all. It sends
+one at its start, when a node is missing (at once, again, then after 1 s, doubling to 30 s), and every ``poll`` seconds
+if requested (operation.md section 7). Its results are hints: a session proves identity.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ class Discovery:
 class PolledDiscovery(Discovery):
     """The discovery of a link on which nodes do not announce themselves, a thread until :meth:`close`.
 
-    It searches only while a node is missing, or on request. Every node that answers is asked, one after the other.
+    It searches only while a node is missing, or on request. Every node found gets an Identify, one after the other.
     """
 
     LONGEST = ROUND

@@ -84,14 +84,14 @@ class MeasuringLink(Port, ABC):
 
     @abstractmethod
     def open_stream(self, node: int, stream: int, length: int) -> StreamPieces:
-        """Take messages of this stream from now on, ``length`` octets each; in place of those before.
+        """Accept messages of this stream from now on, ``length`` octets each, instead of an earlier one.
 
-        Called before the node is asked to stream, as its messages may come before its reply is looked at.
+        Called before Subscribe is sent, because messages may arrive before the reply is processed.
         """
 
     @abstractmethod
     def close_stream(self, node: int, stream: int) -> None:
-        """Take messages of this stream no more."""
+        """Stop accepting messages of this stream."""
 
     @abstractmethod
     def listen(self) -> AbstractContextManager[DataListener]:

@@ -1,4 +1,4 @@
-"""One line of times for all channels of a group: the "synchronized data" of the second paper.
+"""Common times for all channels of a group: the "synchronized data" of the second paper.
 
 There is a row at every multiple of the grid's period. Each channel gives its last value that is not newer than the row
 (never one from the future), with its age; after two of its periods without a value both are NaN. A row waits until

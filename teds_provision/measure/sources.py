@@ -1,4 +1,4 @@
-"""One process for each source address on a bus: a second Open on a pair of addresses ends the first's session.
+"""Reserves each source address on a bus for one process: a second Open on an address pair ends the first session.
 
 On this machine a lock in the home records the user of an address. Another machine, or another home, is noticed by the
 frames that it sends from the same address (operation.md section 6).

@@ -1,4 +1,4 @@
-"""The one rule for which nodes this station measures and moves today, before a session and all through it.
+"""The one rule for the nodes that this station may measure and move, before and during a session.
 
 A person decides by bans, handovers, the whitelist and trust, and any process may write that decision. ``measure``,
 ``ncap``, ``sample``, ``set`` and the API ask here: :func:`require_measurable` before a session, and

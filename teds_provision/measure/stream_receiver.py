@@ -153,7 +153,7 @@ class ReceivedStream:
 
 @dataclass
 class EarlyMessages:
-    """Messages of a stream that was asked for at ``since`` (monotonic ns) and is not registered yet."""
+    """Messages of a stream whose Subscribe was sent at ``since`` (monotonic ns), and that is not registered yet."""
 
     since: int = field(default_factory=time.monotonic_ns)
     messages: deque[DataMessage] = field(default_factory=lambda: deque(maxlen=MOST_EARLY))
@@ -177,9 +177,9 @@ class HearingThread:
         self._thread.start()
 
     def expect(self, node: int, stream: int, length: int) -> StreamPieces:
-        """Keep the messages of a stream that is asked for, ``length`` octets each.
+        """Keep the messages of a stream whose Subscribe is about to be sent, ``length`` octets each.
 
-        On a busy machine they come before its reply is looked at.
+        On a busy machine they arrive before the reply to Subscribe is processed.
         """
         with self._lock:
             self._early[node, stream] = EarlyMessages()

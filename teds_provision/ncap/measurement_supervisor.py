@@ -204,7 +204,7 @@ class MeasurementSupervisor:
     # -- for the API -------------------------------------------------------------------------------------------------
 
     def add(self, members: Mapping[str, Any], owner: str = NCAP) -> dict[str, Any]:
-        """Measure from now on, after every restart too, until it is deleted; ``owner`` is who asked for it.
+        """Measure from now on, also after restarts, until the measurement is deleted; ``owner`` requested it.
 
         ``members`` are those of a request body; those that are absent or null are as the daemon has them. Raises
         UsageError (no node, a sink that cannot be named so), NotFoundError (the group), NodeBusyError (one of the nodes

@@ -62,7 +62,7 @@ class _WaitingNode:
 
 @dataclass
 class _LostNode:
-    """A lost node: where it is asked, when next, and since when."""
+    """A lost node: its last place, since when it is lost, and the time of the next Identify to it."""
 
     sighting: Sighting
     since: float

@@ -1,4 +1,4 @@
-"""One row of the table of what the service measures: what was asked for, its nodes and their reports, its state."""
+"""One measurement of the service: the request, its nodes and their reports, its state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Phase(Enum):
 class RunningMeasurement:
     """One measurement that runs, or tries to.
 
-    ``kept`` has the nodes of a frozen expression once it has selected any; ``asked`` is what was asked for. ``past``:
+    ``kept`` has the nodes of a frozen expression once it has selected any; ``asked`` is the request. ``past``:
     nodes whose reports are obsolete. ``logged``: nodes whose first value is in the audit log.
     """
 

@@ -1,4 +1,4 @@
-"""The waits of the service: how long it pauses between looks at what no event reports.
+"""The intervals at which the service polls facts that no event reports.
 
 One constructor argument passes them from :func:`teds_provision.ncap.service_run.run` on. No option, file or variable
 changes them; tests pass shorter ones.

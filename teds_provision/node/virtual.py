@@ -1,4 +1,4 @@
-"""The virtual transducer: one Tim behind its link servers, as slow as configured, in real time."""
+"""The virtual transducer: a Tim with its link servers, in real time, with configurable delays."""
 
 from __future__ import annotations
 
@@ -423,10 +423,10 @@ class VirtualNode:
             self._reported_missed, self._report_at = missed, now + _NOTICE_EVERY
 
     def _send_frames(self) -> float | None:
-        """Send what may begin now, a frame for each bus, and what follows close behind; seconds until the next one.
+        """Send the frames that are due on each bus, and those close after; return the seconds until the next one.
 
-        The 30 frames of a message on a classic bus leave 0.2 ms apart: to look at everything else between any two of
-        them would take longer than that.
+        The 30 frames of a message on a classic bus are 0.2 ms apart: any other work between two of them would take
+        longer.
         """
         until = time.monotonic() + _COARSE
         while True:

@@ -1,4 +1,4 @@
-"""Joining with a past: the existing facts of a station's store, as events (contract/plant.md section 2).
+"""Joining with an existing store: its facts as events (contract/plant.md section 2).
 
 Nodes that were provisioned before the plant was made stay authentic at every member: what this station signed, and
 still has a record of, is in its first pages.

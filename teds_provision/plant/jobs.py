@@ -1,4 +1,4 @@
-"""Jobs at a station: who may give one, which one an id means, and what prevents work on it."""
+"""Jobs at a station: their signers, finding one by its id, and reasons against work on it."""
 
 from __future__ import annotations
 

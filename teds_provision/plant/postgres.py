@@ -395,9 +395,7 @@ class Registry:
 class PostgresTransport:
     """The registry as a :class:`.transport.Transport`.
 
-    One look at the beginning of a sync, then only what it showed to be new.
-
-    So a sync that finds nothing new is one round trip.
+    Reads an overview at the beginning of a sync, and then only new rows: a sync without news is one round trip.
     """
 
     carries_all = False

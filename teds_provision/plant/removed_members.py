@@ -1,4 +1,4 @@
-"""A removed station: whose keys it had, which are rotated now, and what no roster can repair (contract/plant.md, 7).
+"""A removed station: the keys that it had, their rotation, and what no roster can repair (contract/plant.md, 7).
 
 The holders of a key are taken from all stations' pages, the removed one's beyond ``last`` too: a thief's statements
 there count for nothing else, but it had a key that it names.
@@ -44,7 +44,7 @@ class RemovalReview:
 def review(station: Station, roster: Roster, now: datetime) -> RemovalReview | None:
     """Mark for rotation the keys that a removed station had; None if none was removed.
 
-    A look at every key costs seconds in a large plant, so it is done when the roster removes another one, and each
+    Checking every key takes seconds in a large plant, so it is done when a roster removes another station, and each
     hour.
     """
     if not roster.removed:

@@ -1,4 +1,4 @@
-"""The login of a station at the registry: a secret that never travels, and the verifier that PostgreSQL keeps of it.
+"""The login of a station at the registry: a secret that is never sent, and the verifier that PostgreSQL stores.
 
 RFC 5802 and RFC 7677, in the form of ``pg_authid.rolpassword``. The password is 32 random octets in hex, so neither the
 number of iterations nor SASLprep matters to its strength.

@@ -1,4 +1,4 @@
-"""A line asks an office to sign: the request, how it travels, what comes back (contract/plant.md section 11)."""
+"""Sign requests of a line to an office: the request, its transport, and the answer (contract/plant.md section 11)."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ class Office(Protocol):
 class RemoteOffice:
     """An office behind a registry or a folder; waits ``timeout`` seconds.
 
-    Boards on several readers ask at once: one of them looks for all, and lays down what came for the others.
+    Boards on several readers may wait at once: one thread checks the inbox, and stores answers for the others.
     """
 
     def __init__(self, station: Station, transport: Transport, timeout: float) -> None:

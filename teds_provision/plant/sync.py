@@ -1,4 +1,4 @@
-"""``registry sync``: this station's statements go out, others' come in (contract/plant.md section 6).
+"""``registry sync``: publishes this station's statements and takes in those of others (contract/plant.md section 6).
 
 Every step can be interrupted; the same command carries on. Nothing here needs an honest other side: rosters count by
 the CA's signature, pages by their station's, and this station's own chain is checked before anything is added to it, so

@@ -1,4 +1,4 @@
-"""Fingerprints as people give them: 64 hex digits, or the first 32 and more of them. No cryptography is loaded here."""
+"""Fingerprints as users type them: 64 hex digits, or at least the first 32 of them. Imports no cryptography."""
 
 from __future__ import annotations
 

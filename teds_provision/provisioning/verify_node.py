@@ -1,4 +1,4 @@
-"""Step 7 at a node: whether the session, or the node's own signature, vouches for what was read, and the verdict."""
+"""Step 7 at a node: proof of what was read, by the session or the node's own signature, and the verdict."""
 
 from __future__ import annotations
 

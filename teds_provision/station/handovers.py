@@ -1,4 +1,4 @@
-"""Bundles that left and came, and what became of them (profile.md, "Handover between base stations")."""
+"""Sent and received bundles, and their outcome (profile.md, "Handover between base stations")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CAN frames in words: who to whom, and which part of a message (profile.md, "CAN"; ISO 15765-2)."""
+"""CAN frames as text: sender, receiver, and the part of a message (profile.md, "CAN"; ISO 15765-2)."""
 
 from __future__ import annotations
 

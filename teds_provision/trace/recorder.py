@@ -1,4 +1,4 @@
-"""Writing a trace while commands talk: each record reaches the file at once, and a full disk harms no command."""
+"""Writes a trace while commands run: each record reaches the file at once, and a full disk affects no command."""
 
 from __future__ import annotations
 

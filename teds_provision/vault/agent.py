@@ -1,4 +1,4 @@
-"""``unlock``: a process that holds what opens the vault, in memory alone, until its time is over or ``lock``.
+"""``unlock``: a process that keeps the vault's secret, only in memory, until its time is over or ``lock``.
 
 Commands ask it over a Unix socket of mode 0600 in the home, and each side looks at who is at the other end
 (SO_PEERCRED). Linux only. A request is one octet. ``S``: kind (one octet) ‖ secret, to the end of the stream. ``T``:

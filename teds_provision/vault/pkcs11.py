@@ -1,4 +1,4 @@
-"""The vault whose station key and CA key lie in a PKCS #11 token (a smart card, an HSM, SoftHSM).
+"""The vault whose station key and CA key are in a PKCS #11 token (a smart card, an HSM, SoftHSM).
 
 The keys are made in the token and never leave it. Node keys are wrapped, as in every vault, under master keys; these
 are sealed to the station key in the file ``vault-pkcs11.json``: a one-time key agrees with the station key (ECDH in

@@ -1,4 +1,4 @@
-"""One node's line over BLE: a request, its reply, and what is done when the connection ends in between."""
+"""The link to one node over BLE: requests, replies, and recovery after a lost connection."""
 
 from __future__ import annotations
 

@@ -233,10 +233,10 @@ class BlePort(MeasuringLink):
         )
 
     def find_all(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Return every advertising node, asked one after the other; raises NoNodeError after ``seconds``.
+        """Return every advertising node, identified one after the other; raises NoNodeError after ``seconds``.
 
-        Listens until no new one came for 1.5 s, and for at least ``listen`` seconds. Nodes are asked as soon as they
-        are heard: a new node advertises only for a minute after its tap.
+        Listens until no new one has appeared for 1.5 s, and for at least ``listen`` seconds. Nodes are identified as
+        soon as they are seen: a new node advertises only for a minute after its tap.
         """
         notice(Notice("waiting", f"Looking for nodes over BLE ({self.spec.text}).", seconds))
         began = time.monotonic()

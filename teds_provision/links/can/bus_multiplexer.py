@@ -221,9 +221,9 @@ class BroadcastReplies:
     """One functional Identify of station ``own``: ``answers`` by node address, without the transaction octet.
 
     ``conflicts`` are addresses under which two nodes answered: two first frames within this Identify, two different
-    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A lost frame looks the same, so the caller
-    asks again before reporting it. ``clashes`` are those that are certain: two different beginnings. ``repeated`` are
-    those with two beginnings, alike or not, which no lost frame explains.
+    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A lost frame has the same effect, so the
+    caller sends another broadcast before it reports one. ``clashes`` are certain ones: two different first frames.
+    ``repeated`` have two first frames, equal or not, which a lost frame cannot explain.
     """
 
     own: int
@@ -246,7 +246,7 @@ class BroadcastReplies:
         return set(self._partial)
 
     def add_frame(self, frame: Frame) -> Frame | None:
-        """Take any frame of the bus; returns the flow control that it asks for, if any. Never raises."""
+        """Process any frame of the bus; return the flow control to send, if any. Never raises."""
         ends = addresses(frame.identifier)
         if ends is None or ends[0] != self.own or len(frame.data) < 2:
             return None
@@ -349,7 +349,7 @@ class Listener:
         self.wake()
 
     def wake(self) -> None:
-        """Let a thread that waits in :meth:`get` look around."""
+        """Wake a thread that waits in :meth:`get`."""
         self._frames.put(None)
 
     def offer(self, frame: Frame) -> None:
@@ -421,9 +421,9 @@ class AddressPair:
 
 @dataclass
 class PendingBroadcast:
-    """A functional Identify under way: ``gathering`` is filled by the loop, :meth:`next` waits for news of it.
+    """A functional Identify in progress: the loop fills ``replies``, and :meth:`next` waits for news.
 
-    ``began`` and ``heard_at``: when it was asked, and when the last frame of an answer came (time.monotonic).
+    ``began`` and ``heard_at``: when it was sent, and when the last frame of an answer came (time.monotonic).
     """
 
     replies: BroadcastReplies

@@ -138,9 +138,9 @@ def read_identity(reply: bytes) -> Identity:
 
 
 def ask_one(ask: Callable[[bytes], bytes], *, questions: int = 2) -> Identity | None:
-    """Return the Identify by ``ask`` (a command frame to its reply); None for no answer, or none that is valid.
+    """Return the Identify that ``ask`` gets (from a command frame to its reply); None without a valid answer.
 
-    An answer with missing frames is asked for again, up to ``questions`` questions in all.
+    After an answer with missing frames it is sent again, up to ``questions`` times in all.
     """
     for _ in range(questions):
         try:

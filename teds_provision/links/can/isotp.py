@@ -323,9 +323,9 @@ Taken = Literal["more", "block", "whole", "again", "torn"]
 
 @dataclass
 class Reassembly:
-    """One message of ``peer`` while its frames come in; ``length`` octets in all, ``fd`` the form of its frames.
+    """A message of ``peer`` that is being received: ``length`` octets in all, ``fd`` the form of its frames.
 
-    ``asked`` frames have come since the last flow control.
+    ``asked`` counts the frames since the last flow control.
     """
 
     peer: int
@@ -354,9 +354,9 @@ class Reassembly:
         return self.length > LONGEST
 
     def add_frame(self, data: bytes) -> Taken:
-        """Take a consecutive frame.
+        """Process a consecutive frame.
 
-        ``block`` asks for a flow control, ``again`` is the frame before once more, ``torn`` one out of sequence.
+        Returns ``block`` if flow control is due, ``again`` for a repeated frame, ``torn`` for one out of sequence.
         """
         if data[0] & 0xF != self.number + 1 & 0xF:
             return "again" if data == self.last else "torn"

@@ -225,7 +225,7 @@ class CanLink:
 
 
 class _Exchange:
-    """One request and its reply, repeated as needed. Runs in the thread that asks."""
+    """One request and its reply, repeated as needed. Runs in the caller's thread."""
 
     def __init__(
         self,

@@ -257,12 +257,12 @@ class CanPort(MeasuringLink):
         )
 
     def find_all(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Return every node that answers: what identify shows, and provision chooses from.
+        """Return every node that answers a broadcast: for identify and provision.
 
-        Listens until 300 ms of silence, 3 s at most, and asks each address separately whose answer was torn; unclear
-        ones are reported through ``notice``. With ``listen`` all are asked repeatedly for that time, with 1.5 s for
-        each answer: a node may be busy with another station, or about to start. Raises NoNodeError after ``seconds``,
-        AddressConflictError, LinkError.
+        Listens until 300 ms of silence, 3 s at most, and then sends an Identify to each address whose answer was torn;
+        unclear ones are reported through ``notice``. With ``listen``, broadcasts are repeated for that time, with 1.5 s
+        for each answer: a node may be busy with another station, or still starting. Raises NoNodeError after
+        ``seconds``, AddressConflictError, LinkError.
         """
         return self.find_all_early(seconds=seconds, notice=notice, listen=listen, seen=_ignore)
 
@@ -333,10 +333,10 @@ class CanPort(MeasuringLink):
         return found
 
     def settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
-        """Check unclear answers again: apparent conflicts by asking all once more.
+        """Check unclear answers again: apparent conflicts by another broadcast.
 
-        A reply to a station that ended a moment ago, by chance under our transaction number, looks like a second node;
-        it comes once, a second node each time.
+        A late reply to another station, by chance with our transaction number, looks like a second node; but it comes
+        only once, while a second node answers each time.
         """
         left = until - time.monotonic()
         if found.conflicts and left > 0:

@@ -1,4 +1,4 @@
-"""NDEF messages, their framing alone (NFC Forum NDEF 1.0, section 3.2): octets to records and back.
+"""The framing of NDEF messages (NFC Forum NDEF 1.0, section 3.2): octets to records and back.
 
 The content of foreign records is ignored, so that one bad text record on a tag cannot hide the records that matter.
 Pure; imports no NFC library.

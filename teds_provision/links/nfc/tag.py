@@ -1,4 +1,4 @@
-"""A tag in the field: activation and its NDEF message, on nfcpy, with nothing foreign getting out.
+"""A tag in the field: activation and its NDEF message, on nfcpy, whose exceptions are translated.
 
 Exceptions of nfcpy become :class:`FieldLostError` (the tag does not answer) or :class:`ReaderLostError` (the reader
 does not).

@@ -1,4 +1,4 @@
-"""One measurement as the station keeps it: begun, carried on after a restart, ended in order.
+"""One stored measurement: started, continued after a restart, ended in order.
 
 The way of `measure` and of `ncap run` alike:
 

@@ -1,4 +1,4 @@
-"""Everything known of each node, as the API shows it. Written by the threads of links and measurements, read by all.
+"""The facts of each node for the API. Written by the threads of links and measurements, read by all threads.
 
 The rows of the store and the datasheets are read after a change, not for each request.
 """

@@ -1,7 +1,7 @@
 """A thread for each link: opens it, reopens it after failures, and notices nodes that arrive and leave.
 
-A bus is asked by the look-out that measurements use as well, and its nodes are looked at by a few workers; at a reader
-the tap is served there and then, because the node may be taken away.
+On a bus, the discovery that measurements also use finds nodes, and a few workers inspect them. At a reader, the thread
+itself handles the tap at once, because the node may be taken away.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Work with one node on behalf of a request: where it is now, or at its next tap.
+"""Work with one node on behalf of a request: at its present place, or at its next tap.
 
 The thread of the request meets a node on a bus. For one that comes by NFC the thread of its reader does the work, while
 the node is on it; the request waits for that, and reports until when.

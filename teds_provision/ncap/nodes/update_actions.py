@@ -1,4 +1,4 @@
-"""Records of requested firmware updates: who asked for which, how each board ended, and the image until the end.
+"""Records of requested firmware updates: the owner, the result of each board, and the image until the end.
 
 One action is a record (JSON) and an image in ``updates/`` of the home, a folder of this user alone.
 """

@@ -1,8 +1,8 @@
 """Firmware updates on request: one image, many boards, one action at a time; it outlives a restart of the service.
 
-Each board is planned and updated by ``steps.update``, as the command ``update`` does it. Kept here is what was asked
-for and how each board ended, in ``updates/`` of the home, with the image until the action is over. After a restart the
-same action goes on with the boards that have no result: the step at which a board continues follows from its report.
+Each board is planned and updated by ``steps.update``, as by the command ``update``. The request, the result of each
+board, and the image until the action has ended are stored in ``updates/`` of the home. After a restart the same action
+continues with the boards without a result: the step at which a board continues follows from its report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Paths of IEEE 1451.0-2007 clause 12 (HTTP), read only, off unless asked for: for old clients of an NCAP.
+"""Paths of IEEE 1451.0-2007 clause 12 (HTTP), read only, off by default: for old clients of an NCAP.
 
 TIMDiscovery, TransducerDiscovery, ReadData, ReadTeds, ReadRawTeds, as public programs of that clause use them: names of
 parameters without regard to case, ``.htm`` behind a path or not, answers in XML, text or JSON (``responseFormat``, or

@@ -1,4 +1,4 @@
-"""`/metrics` for Prometheus, in its text format 0.0.4; off unless asked for, and for who has a token like all else."""
+"""`/metrics` for Prometheus, in its text format 0.0.4; off by default; it needs a token as everything else."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class StationState:
         self._repetition = Repetition()
 
     def put(self, job: Callable[[], None]) -> None:
-        """Queue a request; a station that asks on and on without waiting loses what does not fit."""
+        """Queue a request; if a station sends too many without waiting for replies, the excess is dropped."""
         if self.waiting < _MOST_WAITING:
             self.waiting += 1
             self.jobs.put(job)

@@ -320,7 +320,7 @@ class CanServer:
             return wait
 
     def _run_transfers(self, now: float) -> None:
-        """Send the consecutive frames that are due; look now and then at what the other side lets wait."""
+        """Send the consecutive frames that are due; check messages that wait for flow control now and then."""
         look_round = now - self._looked >= _LOOK_ROUND
         if look_round:
             self._looked = now

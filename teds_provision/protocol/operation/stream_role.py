@@ -1,4 +1,4 @@
-"""Subscribe, Stop, Drive, Clock, Arm and what they set going, on the node (operation.md sections 4 and 5). Pure."""
+"""Subscribe, Stop, Drive, Clock, Arm and their effects, on the node (operation.md sections 4 and 5). Pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Durable steps that a run takes in the background while it talks to a node: a thread that lives as long as the run.
+"""Runs the durable steps of a run in a background thread, during the exchanges with a node.
 
 The run's next access to the store waits for them (:class:`.connection.Connection`), so it never
 reads what is older than its own steps, and what it writes comes after them: the order of durable writes is that of the

@@ -1,4 +1,4 @@
-"""Statements and transactions on one connection to SQLite: waited for, undone whole, errors translated.
+"""Statements and transactions on one connection to SQLite: waits, rollbacks, and translated errors.
 
 ``synchronous=FULL``: a commit that returned has reached the disk, unless it was allowed to come later, and a process
 killed at any instant leaves the last commit.

@@ -1,4 +1,4 @@
-"""Access codes by name, apart from the codec: who only asks for a class of TEDS need not load it."""
+"""Access codes by name; separate from the codec, which users of the names need not import."""
 
 from __future__ import annotations
 
