@@ -6,7 +6,10 @@ import zlib
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
+from hypothesis import given
+from hypothesis import strategies as st
 
+from teds_provision.errors import BadDataError
 from teds_provision.protocol import keys
 from teds_provision.protocol.datasheet import SignedNodeKey, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
@@ -63,6 +66,50 @@ def test_a_signature_goes_to_the_library_as_it_spells_it_itself(r: int, s: int) 
     spelled = keys._to_der(r.to_bytes(32, "big") + s.to_bytes(32, "big"))
     good = 0 < r < keys.GROUP_ORDER and 0 < s <= keys.GROUP_ORDER // 2
     assert spelled == (encode_dss_signature(r, s) if good else None)
+
+
+_FIELD = 2**256 - 2**224 + 2**192 + 2**96 - 1
+
+
+@given(st.integers(1, keys.GROUP_ORDER - 1), st.integers(0, 511), st.sampled_from([b"\x04", b"\x02", b"\0"]))
+def test_a_point_is_one_if_the_library_loads_it(secret: int, bent: int, form: bytes) -> None:
+    x, y = (int.from_bytes(part, "big") for part in (SoftwareKey(secret).point[1:33], SoftwareKey(secret).point[33:]))
+    beyond = [(x + _FIELD) % 2**256, (y + _FIELD) % 2**256]  # the same numbers modulo the field
+    for one, other in (
+        (x, y),
+        (x, _FIELD - y),
+        (x ^ 1 << bent % 256, y),
+        (beyond[0], y),
+        (x, beyond[1]),
+        (0, 0),
+        (y, x),
+    ):
+        point = form + one.to_bytes(32, "big") + other.to_bytes(32, "big")
+        assert keys.is_point(point) is _loads(point)
+    assert keys.is_point(SoftwareKey(secret).point)
+    assert not keys.is_point(SoftwareKey(secret).point[:64])
+    assert not keys.is_point(SoftwareKey(secret).point + b"\0")
+
+
+def _loads(point: bytes) -> bool:
+    try:
+        keys.public_key(point)
+    except BadDataError:
+        return False
+    return True
+
+
+@given(st.integers(0, 5))
+def test_the_second_root_of_a_small_x_is_a_point_too(x: int) -> None:
+    """Numbers that a wrong carry or a missing reduction would show at."""
+    right = (x**3 - 3 * x + 0x5AC635D8AA3A93E7B3EBBD55769886BC651D06B0CC53B0F63BCE3C3E27D2604B) % _FIELD
+    y = pow(right, (_FIELD + 1) // 4, _FIELD)
+    for root in (y, _FIELD - y):
+        point = b"\x04" + x.to_bytes(32, "big") + root.to_bytes(32, "big")
+        assert keys.is_point(point) is _loads(point) is (root * root % _FIELD == right)
+        far = b"\x04" + (x + _FIELD).to_bytes(32, "big") + root.to_bytes(32, "big")
+        assert not keys.is_point(far)
+        assert not _loads(far)
 
 
 def test_the_default_can_address_follows_from_the_uuid() -> None:

@@ -32,6 +32,8 @@ from teds_provision.protocol.keys import (
     prove_message,
     verify,
     verify_der,
+    verify_each_once,
+    verify_once,
 )
 from teds_provision.protocol.messages.firmware import FirmwareReport, is_stated
 from teds_provision.teds.codec import security
@@ -317,11 +319,16 @@ def check_signatures(checked: CheckedEvidence) -> Signatures:
     envelope = verify_der(evidence.station, pae(evidence.payload), evidence.signature)
     if shown is None:
         return Signatures(envelope, False, None, None)
-    node_key = verify(shown.node_key, node_key_message(evidence.uuid, shown.node_key), shown.node_key_signature)
+    signed = [(node_key_message(evidence.uuid, shown.node_key), shown.node_key_signature)]
+    if evidence.proof and evidence.node == shown.node_key:
+        signed.append((checked.board, evidence.proof))
+    node_key, *proven = verify_each_once(shown.node_key, signed)  # one key of thousands: it is not kept
+    board: bool | None = proven[0] if proven else None
+    if evidence.proof and not proven:
+        board = verify_once(evidence.node, checked.board, evidence.proof)
     made: bool | None = None
     if evidence.verdict == PASSED and shown.station_key is not None and shown.signature is not None:
         made = verify(shown.station_key, checked.datasheet, shown.signature)
-    board = verify(evidence.node, checked.board, evidence.proof) if evidence.proof else None
     return Signatures(envelope, node_key, made, board)
 
 
