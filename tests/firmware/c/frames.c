@@ -470,6 +470,24 @@ static void after_bus_off_it_is_silent_for_longer_and_longer(void)
     memory_free(board);
 }
 
+static void nothing_from_before_a_loss_is_left(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier = 0;
+    uint8_t data[64];
+    CHECK(identified(board), "the first line is one station's");
+    in(board, TO_NODE + 1, "\x10\x0c\x05\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "another's long question begins");
+    memory_move(board, OWN + 1);
+    in(board, TO_NODE + 0x100, "\x10\x0c\x05\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "it keeps no other station's out after a move");
+    memory_pressed(board);
+    teds_node_bus_off(&board->node);
+    now += 1001 * MS;
+    CHECK(silent(board), "a button that was pressed before a bus-off is no news after it");
+    memory_free(board);
+}
+
 static void nodes_that_meet_sort_themselves_out(void)
 {
     memory_board *board = fresh();
@@ -1069,6 +1087,7 @@ int main(void)
     a_new_address_counts_though_its_reply_is_lost();
     a_board_without_can_has_no_address();
     after_bus_off_it_is_silent_for_longer_and_longer();
+    nothing_from_before_a_loss_is_left();
     nodes_that_meet_sort_themselves_out();
     a_classic_frame_has_eight_octets_at_most();
     what_is_not_for_this_node_is_left_alone();
