@@ -68,6 +68,8 @@ class Peripheral:
         self._workers = WorkerPool()
         self._dropping: set[asyncio.Task[None]] = set()
         self._lines: dict[int, CentralState] = {}
+        self._ending: set[int] = set()
+        """Numbers of connections that are gone, and whose sessions the node has not ended yet."""
         self._tapped_until = 0.0
         self._advertising = False
         self._news = asyncio.Event()
@@ -199,7 +201,9 @@ class Peripheral:
     # -- connections -----------------------------------------------------------------------------------------------
 
     def _connected(self, connection: Any) -> None:
-        number = next(free for free in range(_FIRST_SOURCE, 256) if free not in self._lines)
+        number = next(
+            free for free in range(_FIRST_SOURCE, 256) if free not in self._lines and free not in self._ending
+        )
         line = self._lines[number] = CentralState(number, connection, self._workers)
         connection.on("disconnection", lambda _reason: self._disconnected(line))
         self._advertising = False  # a controller stops advertising when a central connects
@@ -209,9 +213,15 @@ class Peripheral:
         if not line.gone:
             line.gone = True
             del self._lines[line.number]
+            self._ending.add(line.number)
             line.repetition.forget()
-            line.jobs.put(lambda: self._node.lost(line.name))
+            line.jobs.put(lambda: self._end_session(line))
             self._news.set()
+
+    def _end_session(self, line: CentralState) -> None:
+        """End the session of a connection that is gone; only then another one may have its name."""
+        self._node.lost(line.name)
+        self._ending.discard(line.number)
 
     def restarted(self) -> None:
         """Drop every connection: the board has restarted."""

@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from bumble.controller import Controller
@@ -15,7 +16,7 @@ from bumble.hci import Address
 from bumble.host import Host
 
 from teds_provision.node.ble.address import StaticAddress
-from teds_provision.node.ble.peripheral import Peripheral
+from teds_provision.node.ble.peripheral import CentralState, Peripheral
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.node.worker_pool import WorkerPool
@@ -99,3 +100,30 @@ def test_a_node_that_is_switched_off_has_lost_its_connections_and_their_sessions
     finally:
         loop.close()
     assert {thread for thread in threading.enumerate() if thread.is_alive()} <= before, "no thread of it is left"
+
+
+async def connected_meanwhile(node: Node, folder: Path) -> None:
+    peripheral = Peripheral(node, StaticAddress(folder, factory=True))
+    peripheral._workers = WorkerPool(1)
+    done = threading.Event()
+
+    def connect() -> CentralState:
+        known = set(peripheral._lines)
+        peripheral._connected(SimpleNamespace(on=lambda *_: None))
+        (number,) = peripheral._lines.keys() - known
+        return peripheral._lines[number]
+
+    first = connect()
+    first.jobs.put(lambda: busy_until(done))
+    peripheral._disconnected(first)
+    second = connect()
+    assert second.name != first.name, "the session of the first is still to be ended, by its name"
+    done.set()
+    await until(lambda: node.lost_links == [first.name])
+    peripheral._workers.end()
+    assert connect().name == first.name
+
+
+def test_who_connects_while_the_session_before_is_still_to_be_ended_does_not_lose_its_own(tmp_path: Path) -> None:
+    FlashFile.create(tmp_path)
+    asyncio.run(connected_meanwhile(Node(tmp_path), tmp_path))
