@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 
+from teds_provision.provisioning.meeting import IdleStop
 from tests.test_architecture import MODULES
 
 INTERRUPTED = """
@@ -23,6 +24,14 @@ with ending(stop):
 def test_a_command_that_is_about_to_wait_hears_its_signal() -> None:
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=30, check=False)
     assert (done.returncode, done.stdout) == (0, "True True False\n"), done.stderr
+
+
+def test_a_wait_that_was_told_to_stop_did_not_run_out() -> None:
+    """A batch says which of both ended it, also if the time is over by then."""
+    stop = IdleStop(0.0)
+    assert (stop.is_set(), stop.ran_out, stop.is_asked) == (True, True, False)
+    stop.request_stop()
+    assert (stop.is_set(), stop.ran_out, stop.is_asked) == (True, False, True)
 
 
 def test_no_signal_handler_takes_a_lock() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.handover.pending import close, find_handover, list_handovers, undo
+from teds_provision.plant.backlog import backlog
 from teds_provision.protocol.handover.receipt import open_receipt
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
@@ -74,7 +75,9 @@ def test_a_lost_receipt_is_had_again_by_the_same_import(pair: Pair) -> None:
 
 def test_undo_gives_the_key_back_and_rotates_it_before_anything_else(pair: Pair) -> None:
     _, exported = pair.export("move")
+    assert "gave" in {act for act, _, _ in backlog(pair.north)}
     assert undo(pair.north, find_handover(pair.north, exported.plan.id[:8])).fresh
+    assert "gave" not in {act for act, _, _ in backlog(pair.north)}
     assert not undo(pair.north, find_handover(pair.north, exported.plan.id)).fresh
     assert [holder.fingerprint for holder in pair.north.keys.holders()] == [pair.south.fingerprint]
     assert session(pair.north, pair.board) == 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotAuthenticError, PolicyError
-from teds_provision.plant.fetching import open_carried, take_carried
+from teds_provision.plant.fetching import Taken, note_waiting, open_carried, take_carried
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import read_job
 from teds_provision.plant.transport import CarriedPage
@@ -61,6 +61,13 @@ def test_pages_behind_a_gap_wait_until_it_is_filled(plants: Plant) -> None:
     assert take_carried(north, roster, west.fingerprint, [third]).pages == 0
     assert take_carried(north, roster, west.fingerprint, [second, third]).pages == 2
     assert len(north.plant.pages.chain_links(north.plant.pages.chain(west.fingerprint).id)) == before + 3
+
+
+def test_a_chain_waits_for_a_newer_version_until_it_is_read_on(plants: Plant) -> None:
+    west = plants.member("west", "base")
+    for waits in ("A page of format 9.", None):
+        note_waiting(plants.north, west.fingerprint, Taken(waits=waits))
+        assert plants.north.plant.pages.chain(west.fingerprint).waits == waits
 
 
 def test_a_job_of_another_registry_is_refused_though_a_keeper_signed_it(tmp_path: Path) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import itertools
 import json
 import os
 import signal
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,8 +23,8 @@ from securesystemslib.signer import SSlibKey
 from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, TedsProvisionError
 from teds_provision.plant.commands import line as line_command
 from teds_provision.plant.evidence import sign_evidence
-from teds_provision.plant.line import _firmware_in_session
-from teds_provision.plant.verify_evidence import JudgedEvidence
+from teds_provision.plant.line import _firmware_in_session, _named_in
+from teds_provision.plant.verify_evidence import EvidenceTotals, JudgedEvidence
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.plant import evidence as codec
@@ -30,8 +33,10 @@ from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.firmware import read_firmware
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
-from teds_provision.teds.image import SECURITY
-from teds_provision.teds.origin import Origin
+from teds_provision.teds.certificate import CertificateReference
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.origin import ORIGIN, Origin
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.cli.shell import call
 from tests.provisioning.test_firmware import GOOD, FirmwareBoard
@@ -310,6 +315,15 @@ def test_a_process_that_is_killed_ends_evidence_verify_with_an_error(
     assert "ended by signal 9" in error["message"]
 
 
+def test_the_exit_code_of_files_that_processes_share_is_that_of_the_worst() -> None:
+    """A file that cannot be read (4) before what does not hold (1), and no evidence with a higher code before those."""
+    order = (0, 7, 3, 8, 1, 4)
+    for one, other in itertools.product(order, repeat=2):
+        totals = EvidenceTotals(1, {"good": 1}, one)
+        totals.join(EvidenceTotals(2, {"good": 1, "bad": 1}, other))
+        assert totals == EvidenceTotals(3, {"good": 2, "bad": 1}, max(one, other, key=order.index))
+
+
 def test_pins_say_which_board_it_must_have_been(tmp_path: Path, station: Station, board: Board) -> None:
     file, ca, pins = tmp_path / "a.json", tmp_path / "ca.pem", tmp_path / "pins.csv"
     file.write_bytes(evidence_of(station, board))
@@ -345,6 +359,18 @@ def test_evidence_names_the_certificates_and_the_origin_of_the_datasheet(station
     assert "the origin of the facts is not that of the Origin TEDS (130)" in faults(station, invented)
 
 
+def test_evidence_names_nothing_that_its_signature_does_not_list() -> None:
+    """A board's image may hold what was changed beside its signature."""
+    certificate = (1, AccessCode.CERTIFICATE)
+    blocks = {ORIGIN: WRAPPED.encode(), certificate: CertificateReference("7", "lab", "2026-11-01", "0" * 64).encode()}
+    listed = {place: hashlib.sha256(block).digest() for place, block in blocks.items()}
+    for changed in (set(), {ORIGIN}, {certificate}, set(blocks)):
+        shown: Any = SimpleNamespace(signed_blocks=listed | dict.fromkeys(changed, b"\x01" * 32))
+        certificates, origin = _named_in(Image(bytes(10), blocks), shown)
+        assert certificates == (() if certificate in changed else ((1, "0" * 64),))
+        assert origin == (None if ORIGIN in changed else WRAPPED.lines)
+
+
 @pytest.mark.parametrize("report", [GOOD, FirmwareReport("bare", (0, 9, 0)), None], ids=["image", "no-image", "none"])
 def test_evidence_states_the_firmware_of_its_session(station: Station, report: FirmwareReport | None) -> None:
     board = FirmwareBoard(report=report)
@@ -356,6 +382,9 @@ def test_evidence_states_the_firmware_of_its_session(station: Station, report: F
         require_session(station, node)
         read_firmware(node)
         firmware = _firmware_in_session(node)
+        node.leave()
+        require_session(station, node)
+        assert _firmware_in_session(node) is None, "it was said in the session before"
     due = None if report is None else (report.text, f"{report.version_text}+{report.build}", "02" * 32, 0)
     if report is not None and report.image is None:
         due = ("bare", "0.9.0+0", "0" * 64, 0)

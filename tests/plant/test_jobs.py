@@ -174,6 +174,25 @@ def test_a_board_that_falls_silent_before_it_has_a_key_has_its_unit_all_the_same
     assert line.unit_to_json(board.uuid)["unit"] == 1
 
 
+def test_a_unit_whose_try_broke_off_is_not_passed_by_a_test_of_the_board(owner: Station) -> None:
+    """It was made outside the job meanwhile; only the line passes a unit."""
+
+    def silent(function: int) -> None:
+        if function == Function.REQUEST:
+            raise NodeSilentError("It was pulled.")
+
+    line, board = line_of(owner), make_board(1)
+    with pytest.raises(NodeSilentError):
+        build(line, board, _HookedLink(board, before=silent))
+    build(LineRun(owner, None, BuildOrder(profile=ANGLE)), board)
+    tests = LineRun(owner, line.job, only_verify=True)
+    with talk(board) as node:
+        assert verify_only(owner, node, tests, SilentReporter()).verified.verdict == "authentic"
+    assert units(line) == [(1, 1, 0)]
+    build(line, board)
+    assert units(line) == [(1, 2, 2)]
+
+
 def test_a_unit_is_on_the_disk_with_the_key_and_the_verdict_with_the_evidence(owner: Station) -> None:
     """Beside a job a board needs no commit more; its unit is durable before the board may keep the key."""
     seen: list[str] = []
@@ -426,7 +445,8 @@ def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: 
     file = tmp_path / f"{board.uuid.hex()}.csv"
     line = line_of(owner, tmp_path, calibration=CalibrationRule("any", max_age_days=30))
     table = "raw, value\n0, 0\n16384, 6.283185307\n"
-    for dated, why in ((f"# date: {NOW - timedelta(days=31):%Y-%m-%d}\n", "is dated"), ("", "has no date")):
+    wrong = [(f"# date: {NOW + timedelta(days=days):%Y-%m-%d}\n", "is dated") for days in (-32, 3)]
+    for dated, why in (*wrong, ("", "has no date")):
         file.write_text(dated + table)
         with pytest.raises(PolicyError, match=why):
             build(line, board)

@@ -8,7 +8,7 @@ import json
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -44,6 +44,7 @@ from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile.load import find_profile
 from tests.bench import Board
+from tests.provisioning.test_one_verdict import changed_in_flash
 from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ANGLE, NOW, job_of
@@ -149,6 +150,15 @@ def test_nothing_is_asked_twice_for_what_the_board_has(desk: Desk) -> None:
     assert len(desk.at_hand.asked) == 1
 
 
+def test_a_board_whose_teds_were_changed_beside_its_signature_is_signed_again(desk: Desk) -> None:
+    """Under the sequence that it has it takes nothing."""
+    run, board = desk.run(), make_board(1)
+    build(run, board)
+    changed_in_flash(board, (1, AccessCode.CHANNEL))
+    assert build(run, board).verified.verdict == "authentic"
+    assert len(desk.at_hand.asked) == 2
+
+
 def test_an_office_that_is_away_costs_nothing_but_time(desk: Desk) -> None:
     run, board = desk.run(), make_board(1)
     first = desk.request(run, board)
@@ -231,6 +241,20 @@ def test_calibrations_come_along_and_are_fitted_by_the_office(desk: Desk, tmp_pa
     request = desk.at_hand.asked[-1]
     other = proven(request, desk.line, board, nonce=bytes(16), calibration=b"raw, value\n0, 0\n16384, 7\n")
     assert desk.asks(other).refused == "job"
+
+
+@pytest.mark.parametrize("days", [-32, 3, None])
+def test_an_office_takes_no_calibration_that_is_too_old_or_dated_in_the_future(
+    desk: Desk, tmp_path: Path, days: int | None
+) -> None:
+    board, table = make_board(1), "raw, value\n0, 0\n16384, 6.283185307\n"
+    today = datetime.now(UTC)
+    (tmp_path / f"{board.uuid.hex()}.csv").write_text(f"# date: {today:%Y-%m-%d}\n{table}")
+    run = desk.run(tmp_path, calibration=CalibrationRule("any", max_age_days=30))
+    request = desk.request(run, board)
+    dated = "" if days is None else f"# date: {today + timedelta(days=days):%Y-%m-%d}\n"
+    assert desk.asks(proven(request, desk.line, board, calibration=f"{dated}{table}".encode())).refused == "job"
+    assert build(run, board).verified.verdict == "authentic"
 
 
 def test_an_office_notices_that_what_its_profile_extends_was_edited(

@@ -6,14 +6,16 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.web.metrics import text
-from teds_provision.plant import connecting, membership
+from teds_provision.plant import connecting, membership, service
 from teds_provision.plant.demo.cluster import Cluster
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.schema import member_sql
 from teds_provision.plant.service import EVERY, PlantWatch
 from teds_provision.plant.sync import sync
@@ -21,6 +23,7 @@ from teds_provision.protocol.plant.document import open_request
 from teds_provision.station.station import Station
 from tests.pace import until
 from tests.plant.handing import board_of
+from tests.plant.stations import Plant
 from tests.plant.test_synced_by_database import Office
 
 pytestmark = pytest.mark.system
@@ -98,6 +101,19 @@ def test_a_registry_that_is_gone_is_reported_once_and_stops_nothing(office: Offi
         assert [entry["state"] for entry in published] == ["unreachable"]
     finally:
         watch.stop()
+
+
+def test_a_database_is_looked_over_once_an_hour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked, clock = list[float](), [1000.0]
+    home = Plant(tmp_path)
+    monkeypatch.setattr(connecting, "open_transport", lambda station: FolderTransport(home.stick))
+    monkeypatch.setattr(connecting, "check_database", lambda station, transport: looked.append(clock[0]))
+    monkeypatch.setattr(service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    watch, _, _ = watching(home.north)
+    for clock[0] in (1000.0, 1060.0, 4599.0, 4600.0, 4660.0):
+        assert not watch._sync()
+    assert looked == [1000.0, 4600.0]
+    home.close()
 
 
 def test_an_alarm_is_reported(office: Office) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
 from teds_provision import plant
 from teds_provision.errors import PolicyError, UnprovenError
+from teds_provision.protocol.plant.roster import Role, Roster, Share
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
@@ -50,6 +53,12 @@ def verdict(station: Station, image: Image) -> str:
     (together,) = verify_images(snapshot_trust(station), [image])
     assert tuple(together) == alone.checks
     return alone.verdict
+
+
+def now_of(plants: Plant) -> Roster:
+    roster = plants.north.plant.roster
+    assert roster is not None
+    return roster
 
 
 def newest(plants: Plant, station: Station) -> int:
@@ -121,6 +130,69 @@ def test_a_keeper_vouches_for_what_a_station_signed_that_never_joined(plants: Pl
     assert (verdict(plants.north, image), verdict(south, image)) == ("authentic", "authentic")
     with pytest.raises(PolicyError, match="keeper"):
         plant.membership.vouch(south, found)
+
+
+def test_a_keeper_vouches_beside_another_keeper(plants: Plant) -> None:
+    """The word of the first is gone with its role; that of the second stays."""
+    from tests.plant.stations import certified
+
+    old = certified(plants.folder / "old", "old", plants.north)
+    south = plants.member("south", "base", "keeper")
+    board = Board()
+    image = made_by(old, board)
+    old.close()
+    for station in (plants.north, south):
+        station.datasheets.keep_datasheet(image)
+    assert plant.membership.vouch(south, plant.membership.vouchable(south, [board.uuid])) == 1
+    found = plant.membership.vouchable(plants.north, [board.uuid])
+    plants.round()
+    assert plant.membership.vouch(plants.north, found) == 1
+    plants.round()
+    plants.change(plant.owner.draft_removal(plants.north, "south", "stolen", 0))
+    plants.sync(plants.north)
+    assert verdict(plants.north, image) == "authentic"
+
+
+def test_who_lost_sign_and_has_it_again_signs_on(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign", "base")
+    plants.round()
+    without = frozenset[Role]({"line", "base"})
+    plants.change(plant.owner.with_roles(plants.north, "west", without, None))
+    assert now_of(plants).by_key[west.fingerprint].signed is not None
+    plants.change(plant.owner.with_roles(plants.north, "west", without | {"sign"}, None))
+    assert now_of(plants).by_key[west.fingerprint].signed is None
+    plants.round()
+    image = made_by(west, Board())
+    plants.round()
+    assert verdict(plants.north, image) == "authentic"
+
+
+def test_a_station_that_left_knows_no_registry_to_connect_to(plants: Plant, tmp_path: Path) -> None:
+    west = plants.member("west", "base")
+    plant.owner.join(west, now_of(plants), url=f"file:{tmp_path}", events=[])
+    plant.membership.disconnect(west)
+    plant.owner.join(west, now_of(plants), url=None, events=[])
+    assert west.plant.joined is not None
+    assert west.plant.joined.url is None
+
+
+def test_nothing_is_shared_with_nobody(plants: Plant) -> None:
+    """A share whose only receiver was removed is none; another one keeps its other receivers."""
+    south, west = plants.member("south", "base"), plants.member("west", "base")
+    only = Share(("all", ""), (south.fingerprint,))
+    plants.change(plant.owner.shared(plants.north, only))
+    plants.change(plant.owner.draft_removal(plants.north, "south", "retired", None))
+    assert now_of(plants).share == ()
+    plants.change(plant.owner.shared(plants.north, replace(only, to=(west.fingerprint,))))
+    assert [share.to for share in now_of(plants).share] == [(west.fingerprint,)]
+
+
+def test_no_roster_is_dated_before_the_one_it_follows(plants: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The owner's clock was put back."""
+    held = now_of(plants)
+    monkeypatch.setattr(plant.owner, "now", lambda: held.created - timedelta(days=400))
+    drafted = plant.owner.following(plants.north)
+    assert (drafted.created, drafted.expires) == (held.created, held.expires)
 
 
 def test_a_store_of_today_joins_its_owner_retires_it_and_its_datasheets_stay(plants: Plant) -> None:

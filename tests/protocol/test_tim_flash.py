@@ -166,12 +166,13 @@ def test_the_17_of_the_staging_area_comes_after_4_3_and_18_and_before_10() -> No
 
 
 @pytest.mark.parametrize(("seconds", "reply"), [(59.9, BUSY), (60.0, Reply(True))])
+@pytest.mark.parametrize("touch", [update_teds(1, 12), write_teds(1, 12, 1, NAME[1:])], ids=["update", "write"])
 def test_staging_that_was_not_touched_for_60_seconds_gives_way_to_a_write(
-    two: TwoSessions, seconds: float, reply: Reply
+    two: TwoSessions, touch: Command, seconds: float, reply: Reply
 ) -> None:
     assert two.by_nfc(write_teds(1, 12, 0, NAME)).ok
     two.desk.now += 30
-    assert two.by_nfc(update_teds(1, 12)).ok  # this touches it
+    assert two.by_nfc(touch).ok
     two.desk.now += seconds
     assert two.by_can(update_teds(0, 1)) == BUSY, "an Update makes nothing give way"
     assert two.by_can(write_teds(0, 1, 0, META)) == reply

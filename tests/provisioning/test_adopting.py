@@ -215,6 +215,16 @@ def test_another_nodes_name_needs_another_one(station: Station, tmp_path: Path, 
     assert done.verified.verdict == "authentic"
 
 
+def test_a_node_may_call_itself_by_its_own_digits(station: Station, tmp_path: Path) -> None:
+    node = board(tmp_path / "n", named(factory(), 0, UUID.hex()[:8]))
+    done, _ = adopted(station, node)
+    assert done.verified.verdict == "authentic"
+    with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
+        reset_node(station, talk, identify(station, talk))
+    done, _ = adopted(station, node)
+    assert done.verified.verdict == "authentic", "this station knows it by now"
+
+
 def test_two_hundred_channels_are_shown_and_signed(station: Station, tmp_path: Path) -> None:
     blocks = factory()
     many = {**blocks, **{(n, 3): blocks[1, 3] for n in range(2, 201)}}

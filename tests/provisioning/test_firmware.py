@@ -19,6 +19,7 @@ from teds_provision.protocol.messages.frames import Reply
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 from teds_provision.provisioning import identify as identify_step
+from teds_provision.provisioning import verify_node
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.conversation import Conversation
@@ -248,6 +249,21 @@ def test_a_plain_report_replaces_none_of_a_session(station: Station) -> None:
     kept = station.firmware_reports.get(board.uuid)
     assert kept is not None
     assert (kept.report, kept.in_session, kept.signed) == (GOOD.encode(), True, GOOD.encode())
+
+
+def test_what_a_board_says_plainly_is_not_accepted(station: Station) -> None:
+    """Whoever is on the bus may have said it."""
+    board = FirmwareBoard()
+    given(station, board, ANGLE)
+    board.report = OLD
+    for sealed, signed in ((False, GOOD), (True, OLD)):
+        with met(board, on_bus(board)) as node:
+            if sealed:
+                require_session(station, node)
+            verify_node._firmware_at(station, node, accept=True)
+        kept = station.firmware_reports.get(board.uuid)
+        assert kept is not None
+        assert kept.signed == signed.encode()
 
 
 def test_a_report_that_another_program_wrote_does_not_count(station: Station) -> None:

@@ -20,6 +20,7 @@ from teds_provision.errors import BadDatasheetError, NotAuthenticError
 from teds_provision.measure import background_reread
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.verified_session import open_trusted
+from teds_provision.provisioning import identify as identify_module
 from teds_provision.provisioning import readings
 from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.build import BuildOrder
@@ -67,6 +68,32 @@ def looked(station: Station, board: Board) -> NodeVerification:
     with talk(board, over_the_bus(board)) as node:
         require_session(station, node)
         return verify_in_session(station, node, by="measure")
+
+
+def test_a_node_that_is_read_in_a_session_is_in_service_again(station: Station, board: Board) -> None:
+    """A key that a backup brought back: it was retired here, and answers all the same."""
+    with station.durable("test"):
+        station.nodes.remember(board.uuid, retired="replaced by another")
+    assert verified(station, board) == "authentic"
+    station.flush()
+    known = station.nodes.get(board.uuid)
+    assert known is not None
+    assert known.retired is None
+
+
+def test_what_a_board_says_plainly_does_not_replace_what_its_datasheet_said(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(identify_module, "describe", lambda node: SimpleNamespace(channels=9, name="impostor"))
+    stranger = Board(bytes([7]) * 10)
+    before = station.nodes.get(board.uuid)
+    assert before is not None
+    for one, channels, name in ((board, before.channels, before.name), (stranger, 9, "impostor")):
+        with talk(one) as node:
+            identify_module._identified(station, node, add=False)
+        known = station.nodes.get(one.uuid)
+        assert known is not None
+        assert (known.channels, known.name) == (channels, name)
 
 
 def verified(station: Station, board: Board) -> str:

@@ -251,6 +251,27 @@ def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Pa
     assert later.row_for(board_of(5), "") is later.sheet.rows[0], "nobody has it"
 
 
+def test_a_row_that_was_tried_without_a_board_goes_before_the_one_of_a_board_that_failed_yesterday(
+    station: Station, tmp_path: Path
+) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
+    first, second = progress.sheet.rows
+    progress.assign_row(second, board_of(2))
+    progress.note(second, BoardResult(board_of(2), 1.0, error=NodeSilentError("It is silent."), row=2))
+    today = Progress(station.home, progress.sheet)
+    today.turn_away(first, board_of(1))
+    today.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("Its name is another's."), row=1))
+    assert today.row_for(board_of(3), "") is first
+
+
+def test_the_mean_of_a_step_is_that_of_the_boards_that_passed(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    for row, result, seconds in zip(progress.sheet.rows, ("passed", "failed", "passed"), (1.0, 9.0, 2.0), strict=True):
+        progress.rows[row.number].result = result
+        progress.rows[row.number].steps = {"write": seconds}
+    assert progress.totals().steps == {"write": 1.5}
+
+
 def test_a_no_is_no_try_of_a_board(station: Station, tmp_path: Path) -> None:
     """A board that passed when it was held there again counted as one that needed two tries."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\n"))

@@ -28,7 +28,7 @@ from teds_provision.links import LinkSettings
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
-from teds_provision.provisioning import update
+from teds_provision.provisioning import image_manager, update
 from teds_provision.provisioning.agree import reset_node
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
@@ -381,6 +381,23 @@ def test_an_update_resumes_after_an_interruption_at_any_exchange(
 ) -> None:
     for at in range(1, exchanges_of(owner, tmp_path) + 1):
         interrupted(owner, tmp_path / str(at), interruption, at)
+
+
+def test_losses_count_from_the_last_piece_that_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long upload on a bad bus loses more in all than one piece may."""
+    sent = iter(range(30))
+
+    def once(self: ImageManager, octets: bytes) -> Iterator[tuple[int, int]]:
+        for _ in range(2):
+            if (at := next(sent, None)) is None:
+                return
+            yield 1, at + 1
+        raise NodeSilentError("A frame is lost.")
+
+    monkeypatch.setattr(ImageManager, "_upload_once", once)
+    node: Any = SimpleNamespace(identity=SimpleNamespace(max_message=1000), is_alive=lambda: True, reopen=lambda: None)
+    monkeypatch.setattr(image_manager, "_LOSSES", 3)
+    assert ImageManager(node).upload(bytes(30), lambda done, of: None) == 30
 
 
 # -- hostile boards and a hostile bus ----------------------------------------------------------------------------------

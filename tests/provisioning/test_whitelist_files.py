@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import string
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -227,6 +228,16 @@ def test_an_unpinned_entry_gains_a_key_and_keeps_the_rest(station: Station) -> N
     assert after is not None
     assert (after.fingerprint, after.name, after.assurance, after.added) == (KEY, "finger", "import", before.added)
     assert plan_addition(station, [ListedNode(1, ONE), ListedNode(2, ONE, KEY)]).write == ()
+    station.pins.put(replace(before, assurance="wired"))
+    put(station, ListedNode(1, ONE, KEY))
+    after = station.pins.entry(ONE)
+    assert after is not None
+    assert (after.fingerprint, after.assurance) == (KEY, "wired"), "a list takes no assurance away"
+
+
+def test_the_first_name_that_a_file_gives_a_node_is_its_name(tmp_path: Path) -> None:
+    text = f"uuid,name\n{ONE.hex()},\n{ONE.hex()},finger\n{ONE.hex()},thumb\n"
+    assert [entry.name for entry in read(tmp_path, text)] == ["finger"]
 
 
 def test_the_key_that_a_node_has_proved_counts_as_pinned(station: Station) -> None:

@@ -19,7 +19,7 @@ from teds_provision.protocol.operation.commands import OPERATION, ChannelState, 
 from teds_provision.provisioning import board_type
 from teds_provision.provisioning.agree import require_session, reset_node
 from teds_provision.provisioning.batch import BatchRun, ProvisionRequest
-from teds_provision.provisioning.board_type import WrongBoardError, check_hardware, differences, operate
+from teds_provision.provisioning.board_type import WrongBoardError, check_hardware, differences, is_remembered, operate
 from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
@@ -140,6 +140,22 @@ def test_what_was_merely_built_for_a_board_makes_it_no_board_of_that_type(
     build(station, uuid, BuildOrder(FORCE))
     with pytest.raises(WrongBoardError):
         given(station, on_reader(angle), BuildOrder())
+
+
+def test_what_was_built_for_a_board_counts_no_more_where_its_profile_is_known(
+    station: Station, angle: VirtualNode, tmp_path: Path
+) -> None:
+    """The profile may be that of what was built; without it, it is that of a node that came in a bundle."""
+    uuid = angle.tim.flash.uuid
+    with station.durable("test"):
+        station.nodes.remember(uuid, profile=FORCE)
+    assert is_remembered(station, uuid, FORCE, factory=False)
+    assert is_remembered(station, uuid, None, factory=False)
+    assert not is_remembered(station, uuid, ANGLE, factory=False)
+    with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
+        identify(station, node)
+    build(station, uuid, BuildOrder(FORCE))
+    assert not is_remembered(station, uuid, FORCE, factory=False)
 
 
 def test_our_own_board_after_a_reset_is_no_retype(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
