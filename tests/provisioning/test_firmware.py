@@ -256,6 +256,8 @@ def test_what_a_board_says_plainly_is_not_accepted(station: Station) -> None:
     board = FirmwareBoard()
     given(station, board, ANGLE)
     board.report = OLD
+    with station.durable("test"):
+        station.firmware_reports.make_hint(board.uuid)
     for sealed, signed in ((False, GOOD), (True, OLD)):
         with met(board, on_bus(board)) as node:
             if sealed:
@@ -264,6 +266,7 @@ def test_what_a_board_says_plainly_is_not_accepted(station: Station) -> None:
         kept = station.firmware_reports.get(board.uuid)
         assert kept is not None
         assert kept.signed == signed.encode()
+        assert [entry.act for entry in station.audit_log.entries()].count("firmware") == sealed
 
 
 def test_a_report_that_another_program_wrote_does_not_count(station: Station) -> None:
