@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import GarbledError, PolicyError
+from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, PolicyError
 from teds_provision.measure import node_supervisor
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.clock import HostClock
@@ -17,6 +17,7 @@ from teds_provision.measure.planning import BusShare
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.measurement_job import MeasurementJob
+from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.store.records import KeptMeasurement
 
 UUID = bytes(range(10))
@@ -208,3 +209,91 @@ def test_the_end_of_a_measurement_is_stored_with_its_first_value_and_not_moved_b
     assert ends == pytest.approx(time.time() + 600.0, abs=60.0)
     job._began(5.0)
     assert job.kept.ends == ends
+
+
+@pytest.mark.parametrize("failure", [None, LinkError("The adapter was pulled.")])
+def test_a_node_that_is_silent_is_lost_by_the_fault_of_its_link_if_that_has_one(
+    failure: LinkError | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    supervisor = supervisor_at([0.0], monkeypatch)
+    streams = SimpleNamespace(tell_time=lambda _trusted: None, silent=lambda _now: 5.0, clock=SimpleNamespace(lie=""))
+    monkeypatch.setattr(supervisor, "streams", streams)
+    standing, bus = (
+        SimpleNamespace(require=lambda: None, mark=""),
+        SimpleNamespace(hearing=SimpleNamespace(failure=failure)),
+    )
+    none: Any = None
+    with pytest.raises(LinkError, match="pulled" if failure else r"No message from the node for 5\.0 s"):
+        supervisor._watch(cast(Any, bus), none, cast(Any, standing), None)
+
+
+@pytest.mark.parametrize(
+    ("reason", "beside", "change", "shared"),
+    [
+        (Reason.DOES_NOT_FIT, True, {}, True),
+        (Reason.NO_ROOM, True, {}, False),
+        (Reason.DOES_NOT_FIT, False, {}, False),
+        (Reason.DOES_NOT_FIT, True, {"ran": True}, False),
+        (Reason.DOES_NOT_FIT, True, {"patient": True}, False),
+    ],
+)
+def test_a_node_that_another_process_measures_too_is_given_up_only_before_its_first_value(
+    reason: Reason, beside: bool, change: dict[str, bool], shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    holder = {UUID: "measure arm (process 12)"} if beside else {}
+    supervisor = supervisor_at([0.0], monkeypatch, beside=holder, patient=change.get("patient", False))
+    supervisor.ever_ran = change.get("ran", False)
+    error = supervisor._is_shared(NodeRefusedError("No.", reason=reason))
+    assert (error is not None) is shared
+    assert error is None or "measure arm (process 12)" in error.message
+    assert supervisor._is_shared(LinkError("It is silent.")) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "numbers"),
+    [
+        ({}, [2]),
+        ({"channels": (2, 1)}, [2]),
+        ({"channels": (1,)}, []),
+        ({"actuators": False}, []),
+        ({"unsigned": True}, []),
+        ({"unverified": True}, []),
+        ({"listed": False}, []),
+    ],
+)
+def test_set_points_are_taken_for_actuators_of_a_signed_node_on_the_whitelist_alone(
+    change: dict[str, Any], numbers: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = {name: value for name, value in change.items() if name in ("channels", "actuators")}
+    supervisor = supervisor_at([0.0], monkeypatch, **{"actuators": True} | wanted)
+    entry = object() if change.get("listed", True) else None
+    monkeypatch.setattr(supervisor, "_station", SimpleNamespace(pins=SimpleNamespace(entry=lambda _uuid: entry)))
+    channels = [
+        SimpleNamespace(number=number, actuator=actuator, value_problem=problem)
+        for number, actuator, problem in ((1, False, ""), (2, True, ""), (3, True, "it has no calibration."))
+    ]
+    trusted: Any = SimpleNamespace(
+        unsigned=change.get("unsigned", False),
+        unverified=change.get("unverified", False),
+        sheet=SimpleNamespace(channels=channels),
+    )
+    assert [channel.number for channel in supervisor._actuators(trusted)] == numbers
+
+
+def test_an_announce_is_settled_by_a_value_and_a_sighting_elsewhere_is_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, last = [100.0], [0.0]
+    supervisor = supervisor_at(now, monkeypatch)
+    streams = SimpleNamespace(every=lambda: 0.1, heard_since=lambda since: last[0] > since, silent=lambda _now: 0.0)
+    monkeypatch.setattr(supervisor, "streams", streams)
+    supervisor._heard_announce()
+    now[0] += 0.1
+    last[0] = now[0]
+    assert not supervisor._doubted(now[0])
+    now[0] += 5.0
+    assert not supervisor._doubted(now[0]), "the value that came settled it"
+    supervisor._seen_elsewhere()
+    assert not supervisor._is_gone()
+    now[0] += 0.5
+    assert supervisor._is_gone(), "its answers come from there now: this one is not waited for"
+    with pytest.raises(LinkError, match="restarted, or now answers elsewhere"):
+        supervisor._doubted(now[0])

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from starlette.requests import Request
@@ -305,3 +305,107 @@ def test_a_node_whose_actuator_is_in_use_is_let_go_to_any_command_but_an_update(
         "refused: Actuator 3 of the board is in use; the restart would end that.\n",
         "not measured\n",
     ]
+
+
+def open_to(service: Service, monkeypatch: pytest.MonkeyPatch) -> RunningMeasurement:
+    """Return a measurement that takes nodes in, in whose selection every node is, at a place with room."""
+    running = listed(service)
+    running.asked = running.kept = replace(running.kept, match="all")
+    monkeypatch.setattr(service.measurements, "_why_not", lambda _running, _uuid: "")
+    monkeypatch.setattr(service.measurements, "_room_of", lambda _uuid: 0.5)
+    sighting = SimpleNamespace(identity=SimpleNamespace(state=None))
+    monkeypatch.setattr(service.buses.presence, "seen_at", lambda _uuid: sighting)
+    return running
+
+
+def test_a_node_that_joins_is_shown_again_here_and_in_no_other_measurement(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, kept = open_to(service, monkeypatch), KeptMeasurement("2")
+    other = RunningMeasurement(kept, Membership(0.0), kept)
+    service.measurements._running["2"] = other
+    other.over.set()
+    supervisor: Any = object()
+    measurement: Any = SimpleNamespace(join=lambda _uuid: supervisor)
+    running.membership.members[NODE] = Member(joined=False, locked=True)
+    running.past.add(NODE)
+    service.measurements._join(running, measurement, NODE)
+    assert running.membership.members[NODE].supervisor is supervisor
+    assert (running.past, other.past, running.uuids) == (set(), {NODE}, (NODE,))
+    assert service.directory.seen(NODE).measurement == "1"
+    service.measurements._release(running, NODE)
+    assert service.directory.seen(NODE).measurement is None
+
+
+def test_a_node_that_ended_is_shown_on_unless_it_is_selected_no_more(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, job = open_to(service, monkeypatch), cast(Any, SimpleNamespace(lent=set()))
+    done = threading.Event()
+    ended: Any = SimpleNamespace(done=done, uuid=bytes.fromhex(NODE), error=None, sighting=None)
+    for why, past in (("", set()), ("its name is not x*", {NODE})):
+        running.membership.members[NODE] = Member(supervisor=ended)
+        done.clear()
+        service.measurements._reap(running, job, NODE, 0.0)
+        assert NODE in running.membership.members, "it measures"
+        done.set()
+        monkeypatch.setattr(service.measurements, "_why_not", lambda _running, _uuid, why=why: why)
+        service.measurements._reap(running, job, NODE, 0.0)
+        assert (running.membership.members, running.past) == ({}, past)
+
+
+def test_who_is_meant_is_asked_once_for_each_change(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    running, asked = open_to(service, monkeypatch), list[float]()
+
+    def select_again(_seen: object) -> list[str]:
+        asked.append(now)
+        return []
+
+    monkeypatch.setattr(running.membership, "select_again", select_again)
+    running.version = service.station.version()
+    for now in (1000.0, 2000.0, 3000.0):
+        service.measurements._follow_the_store(running, now)
+        service.measurements._follow_the_store(running, now)
+        if now == 1000.0:
+            service.measurements.look_who_is_meant()
+    assert asked == [2000.0]
+
+
+def test_a_measurement_that_is_stopped_does_not_begin_again_with_other_nodes(service: Service) -> None:
+    for stopped in (False, True):
+        running = listed(service, NODE)
+        kept = service.station.measurements.keep(running.kept)
+        running.kept = running.asked = kept
+        running.again = True
+        if stopped:
+            running.stop.set()
+        service.measurements._finish(running)
+        assert running.phase is (Phase.OVER if stopped else Phase.LOCKING)
+        running.phase = Phase.OVER
+
+
+def test_nodes_as_they_come_have_no_actuator_claimed_and_one_expression_is_measured_once(service: Service) -> None:
+    made = service.measurements.add({"match": "all", "actuators": True, "rate": 20.0})
+    assert not service.station.measurements.get(made["id"]).actuators
+    service.measurements.match("all", rate=20.0)
+    assert [shown["id"] for shown in service.measurements.all()] == [made["id"]]
+    service.measurements.match("all", rate=10.0)
+    assert {shown["id"] for shown in service.measurements.all()} == {made["id"], "run"}
+
+
+def test_the_worst_bound_of_a_clock_is_that_of_a_node_which_gives_values_now(service: Service) -> None:
+    assert service.measurements.clock_error() is None
+    running = listed(service, NODE, OTHER)
+    for node, state, error in ((NODE, "running", 0.002), (OTHER, "lost", 9.0)):
+        service.measurements._report(running, NodeReport(node, state, clock_error=error))
+    assert service.measurements.clock_error() == 0.002
+    service.measurements._report(running, NodeReport(OTHER, "running"))
+    assert service.measurements.clock_error() == 0.002, "none is known of it"
+
+
+def test_a_node_whose_values_come_has_no_problem_any_more(service: Service) -> None:
+    running = listed(service, NODE)
+    for state, why, problem in (("refused", "It is revoked.", True), ("running", "", False), ("lost", "Silent.", True)):
+        service.measurements._report(running, NodeReport(NODE, state, why))
+        assert (service.directory.seen(NODE).problem is not None) is problem
+        assert service.directory.seen(NODE).present is (state != "refused")
