@@ -325,3 +325,27 @@ def test_the_exchanges_of_a_clock_take_their_memory_at_once() -> None:
     for number in range(2 * EXCHANGES):
         assert clock.exchange(node.exchange(BOOT + (1 + number) * SECOND)), clock.lie
     assert octets() == before < 2000
+
+
+def test_the_wall_clock_is_the_narrowest_of_some_readings_and_a_step_is_seen_by_two(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One reading that was interrupted between the two clocks is no clock that was set."""
+    monotonic = iter([0, 2_000_000, 10_000_000, 10_000_400, 20_000_000, 21_000_000])
+    wall = iter([1_001_000_000, 1_010_000_300, 1_020_500_000])
+    reading = SimpleNamespace(monotonic_ns=lambda: next(monotonic), time_ns=lambda: next(wall))
+    with monkeypatch.context() as patch:
+        patch.setattr("teds_provision.measure.clock.time", reading)
+        found = WallClock.now(3)
+    assert (found.offset, found.error) == pytest.approx((1.0000001, 200e-9))
+    host, asked = HostClock(WallClock(1.0)), list[int]()
+    for offsets, was_set in (({1: 1.0}, False), ({1: 9.0, 9: 1.0}, False), ({1: 9.0, 9: 9.0}, True)):
+        asked.clear()
+
+        def now(readings: int = 9, offsets: dict[int, float] = offsets) -> WallClock:
+            asked.append(readings)
+            return WallClock(offsets[readings])
+
+        monkeypatch.setattr(WallClock, "now", now)
+        assert host.was_set() is was_set
+        assert asked == list(offsets)

@@ -17,7 +17,7 @@ from teds_provision.errors import AddressConflictError, NodeRefusedError, NoNode
 from teds_provision.links.can.link import conflict
 from teds_provision.links.discovery import PolledDiscovery, Sighting
 from teds_provision.links.ports import Contact
-from teds_provision.measure import request
+from teds_provision.measure import presence, request
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.presence import MOST, TWIN, Presence
 from teds_provision.measure.request import Requirements
@@ -355,3 +355,18 @@ def test_datasheets_are_waited_for_from_the_first_one_on_however_many_come(monke
     for uuid in (ONE, TWO):
         requirements.offer(uuid, sheet(uuid), threading.Event())
         assert now[0] == pytest.approx(110.0)
+
+
+def test_two_nodes_at_one_address_are_the_reason_for_half_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(presence, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    sightings = Presence()
+    sightings.add_sighting(seen(ONE, 7, at=100.0))
+    sightings.add_sighting(seen(TWO, 8, at=100.0))
+    sightings.conflict("can:x", 7, AddressConflictError("Two nodes answer at 0x07.", hint="Change one."))
+    assert sightings.seen_at(ONE) is None, "nothing is opened there"
+    assert sightings.seen_at(TWO) is not None
+    for after, error in ((29.0, AddressConflictError), (31.0, NoNodeError)):
+        now[0] = 100.0 + after
+        with pytest.raises(error):
+            find(sightings, ONE, seconds=-1.0)

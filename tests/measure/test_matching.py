@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NoRoomError, UsageError
+from teds_provision.errors import NoRoomError, NotFoundError, UsageError
 from teds_provision.links.can.airtime import CanAirtime
 from teds_provision.measure import matching
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
@@ -95,3 +95,55 @@ def test_the_load_of_a_node_is_that_of_its_sensors_at_the_fastest_rate(monkeypat
     assert load_of(station, b"unknown", MeasurementRequest(), time) == NodeLoad()
     every.clear()
     assert load_of(station, b"known", MeasurementRequest(), time) == NodeLoad(), "its session will show it"
+
+
+def test_of_the_known_nodes_those_are_meant_whose_key_is_held_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    records = [SimpleNamespace(uuid=bytes([number]) * 10, name=name, profile="") for number, name in enumerate("abc")]
+    held = {records[0].uuid, records[2].uuid}
+    station: Any = SimpleNamespace(
+        nodes=SimpleNamespace(all=lambda: records, get={record.uuid: record for record in records}.get),
+        keys=SimpleNamespace(held=held.__contains__),
+    )
+    assert matching.known_nodes(station, "all") == [records[0].uuid, records[2].uuid]
+    assert matching.known_nodes(station, "name:[ab]") == [records[0].uuid]
+    with pytest.raises(NotFoundError, match="No node whose key this station holds matches 'name:b'"):
+        matching.known_nodes(station, "name:b")
+
+
+def test_a_type_that_is_near_is_one_that_can_be_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [
+        SimpleNamespace(name="gripper", profile=SimpleNamespace(abstract=False)),
+        SimpleNamespace(name="gripper-base", profile=SimpleNamespace(abstract=True)),
+        SimpleNamespace(name="griper", profile=None),
+    ]
+    monkeypatch.setattr(matching, "list_profiles", lambda _folders: entries)
+    monkeypatch.setattr(matching, "default_folders", lambda _home: ())
+    station: Any = SimpleNamespace(home=None)
+    assert matching.nearest_types("gripper-bas", station) == ["gripper", "griper"]
+    assert matching.nearest_types("gripperr", station) == ["gripper", "griper"]
+    assert matching.nearest_types("x", station) == []
+
+
+@pytest.mark.parametrize(
+    ("mode", "origin", "verdict", "channels", "why"),
+    [
+        ("transparent", "session", "unsigned", True, ""),
+        ("transparent", "kept", "unsigned", True, ""),
+        ("transparent", "plain", "unsigned", True, "its datasheet is unsigned"),
+        ("transparent", "session", "authentic", True, "its datasheet is authentic"),
+        ("transparent", "", "", True, "its datasheet was not read in a session"),
+        ("transparent", "session", "unsigned", False, "it has no datasheet of its own"),
+        ("whitelist", "session", "unsigned", True, "detection is not transparent"),
+    ],
+)
+def test_an_unsigned_node_is_one_whose_datasheet_was_read_in_a_session(
+    mode: str, origin: str, verdict: str, channels: bool, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = SimpleNamespace(origin=origin, verified=SimpleNamespace(verdict=verdict)) if origin else None
+    monkeypatch.setattr(matching, "verdict_of", lambda _station, _uuid: judged)
+    sheet = SimpleNamespace(channels=[object()] if channels else [])
+    monkeypatch.setattr(matching, "Sheet", SimpleNamespace(from_image=lambda _image: sheet))
+    station: Any = SimpleNamespace(
+        measurements=SimpleNamespace(detection=mode), datasheets=SimpleNamespace(datasheet=lambda _uuid: object())
+    )
+    assert matching.UnsignedNodes().why_not(station, bytes(10)) == why

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -64,3 +65,25 @@ def test_a_node_that_was_given_back_is_expected_on_its_bus_before_it_begins(endi
         Measurement.resume_node(loop, uuid)
     assert course == ["expected"] + ([] if ending else ["begun"])
     assert loop.lent == {stranger}
+
+
+def test_the_seconds_of_a_measurement_count_from_the_first_sample_of_its_last_stream() -> None:
+    began: list[bool] = []
+
+    def until(now: float, duration: float | None, left: float | None, *first: float, ran: bool = True) -> float:
+        streams = [SimpleNamespace(first_sample=lambda at=at: at) for at in first]
+        loop: Any = SimpleNamespace(
+            _common_start=SimpleNamespace(seconds_left=left),
+            supervisors=[SimpleNamespace(ever_ran=ran, streams=stream) for stream in streams],
+            began=lambda: began.append(True),
+        )
+        return Measurement._until(loop, now, duration)
+
+    assert until(100.0, None, 0.0, 0.0) == math.inf
+    assert until(100.0, 5.0, None, 0.0) == math.inf, "it waits for its trigger"
+    assert until(100.0, 5.0, 0.0, 0.0, ran=False) == math.inf
+    assert began == []
+    assert until(100.0, 5.0, 0.0, 0.0, 0.0) == 105.0
+    assert until(100.0, 5.0, 0.0, 100.4, 101.5) == 106.5
+    assert until(100.0, 5.0, 2.0, 101.5) == 107.0
+    assert began == [True] * 3

@@ -132,3 +132,31 @@ def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(rig: Rig)
     service.kill()
     for number in readers:
         number.join(60)
+
+
+def test_the_text_of_a_node_is_made_again_when_it_changed_and_while_it_ages(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing: Any = None
+    silence: Any = NoListeners()
+    roster, made = NodeDirectory(nothing, silence), list[str]()
+    channel: dict[str, Any] = {"last": None, "actuator": None}
+
+    def node(uuid: str) -> dict[str, Any]:
+        made.append(uuid)
+        return {"uuid": uuid, "count": len(made), "channels": [channel], "problem": None, "measuring": None}
+
+    monkeypatch.setattr(roster, "node", node)
+
+    def counts(*, reader: bool = False) -> list[int]:
+        return [shown["count"] for shown in json.loads(roster.nodes_text(reader=reader))["nodes"]]
+
+    roster.note("a" * 20, "came", present=True)
+    assert [counts(), counts(), counts(reader=True), counts(reader=True), counts()] == [[1], [1], [2], [2], [1]]
+    roster.note("a" * 20, problem=None)
+    assert [counts(), counts()] == [[3], [3]], "something of it changed"
+    roster.touch()
+    assert [counts(), counts()] == [[4], [4]], "names of topics changed"
+    for member in channel:
+        channel.update({"last": None, "actuator": None} | {member: {"age": 0.1}})
+        roster.touch()
+        before = len(made)
+        assert [counts(), counts()] == [[before + 1], [before + 2]], f"its {member} has an age"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -123,3 +124,32 @@ def test_who_waits_for_a_refusal_gives_the_place_back(tmp_path: Path, monkeypatc
     for _ in range(3):
         assert status_of(guard, {"host": HERE, "authorization": "Bearer nonsense"}) == 429
     assert slept == [0.0] * 3
+
+
+def test_what_the_page_says_of_its_own_files_is_said_once(tmp_path: Path) -> None:
+    """A browser that finds two answers may take the one that keeps an old page for ever."""
+    sent: list[Message] = []
+
+    async def page(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"Cache-Control", b"no-cache")]})
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    none: Any = None
+    asyncio.run(
+        Guard(page, Tokens(tmp_path), None)({"type": "http", "method": "GET", "path": "/", "headers": []}, none, send)
+    )
+    names = [name.lower() for name, _ in sent[0]["headers"]]
+    assert names.count(b"cache-control") == 1
+    assert b"content-security-policy" in names
+
+
+def test_a_token_that_has_expired_is_not_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tokens = Tokens(tmp_path)
+    tokens.add("script")
+    tokens.login(tokens.login_link())
+    assert [token.name for token in tokens.all()] == ["script", "browser"]
+    later = time.time() + 31 * 86_400
+    monkeypatch.setattr(time, "time", lambda: later)
+    assert [token.name for token in tokens.all()] == ["script"]

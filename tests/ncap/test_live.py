@@ -265,3 +265,18 @@ def test_fifty_clients_of_which_ten_never_read(service: Service) -> None:
         succeeds(5, lost, because="a hundred samples a second beside fifty listeners")
     until(lambda: asked.status()["clients"] == 0)
     asked.request("DELETE", f"/measurements/{asked.request('GET', '/measurements')['measurements'][0]['id']}")
+
+
+def test_what_a_client_missed_is_told_once() -> None:
+    async def run() -> list[list[dict[str, Any]]]:
+        client, found = LiveClient(), []
+        for several in (3, 1, 2):
+            for number in range(several):
+                client.values(json.dumps({"type": "values", "number": number}))
+            found.append([json.loads(text) for text in await client.wait()])
+        return found
+
+    first, second, third = asyncio.run(run())
+    assert first == [{"type": "dropped", "messages": 2}, {"type": "values", "number": 2}]
+    assert second == [{"type": "values", "number": 0}]
+    assert third == [{"type": "dropped", "messages": 1}, {"type": "values", "number": 1}]

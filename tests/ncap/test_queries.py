@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from starlette.requests import Request
 
-from teds_provision.errors import UsageError
-from teds_provision.ncap.web import clause12, resources
+from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, TedsProvisionError, UsageError
+from teds_provision.ncap.web import app, clause12, metrics, resources
 from teds_provision.ncap.web.clause12 import Clause12
-from teds_provision.ncap.web.guard import Caller, RequestRefusedError, _require_may_change
+from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError, _require_may_change
 
 
 def request(query: str = "", *headers: tuple[str, str]) -> Request:
@@ -121,3 +122,37 @@ def test_names_of_clause_12_are_separated_by_commas_alone_and_a_module_keeps_its
     for word in ("", "-1", "65536", "x"):
         with pytest.raises(UsageError, match="channelId must be a number"):
             clause12._integer({"channelid": word}, "channelId")
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_metrics_name_no_folder_to_who_may_only_read(read_only: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "text", lambda status, _parts: status["sinks"][0]["name"])
+    daemon: Any = SimpleNamespace(status=lambda: {"sinks": [{"name": "/home/ann/run.csv"}]}, parts={})
+    asked = request()
+    asked.scope[CALLER] = Caller("a", "script", read_only)
+    answer = metrics.route(daemon).endpoint(asked)
+    assert answer.body.decode() == ("run.csv" if read_only else "/home/ann/run.csv")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "error", "logged"),
+    [
+        ("PUT", {"uuid": "ab" * 10}, FrozenError("It is measured."), ["frozen"]),
+        ("PUT", {"uuid": "ab" * 10, "number": 3}, PolicyError("Beyond its limits."), []),
+        ("GET", {"uuid": "ab" * 10}, FrozenError("It is measured."), []),
+        ("PUT", {}, NotFoundError("No node."), []),
+        ("PUT", {}, StoreError("The disk is full."), []),
+    ],
+)
+def test_a_refused_change_is_logged_once(
+    method: str, path: dict[str, Any], error: TedsProvisionError, logged: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A set point has an entry of its own; what does not exist, and a store that fails, are none."""
+    outcomes: list[tuple[bytes | None, str]] = []
+    station = SimpleNamespace(audit=lambda _act, uuid, outcome, **_facts: outcomes.append((uuid, outcome)))
+    daemon: Any = SimpleNamespace(station=station)
+    scope = {"type": "http", "method": method, "path": "/x", "path_params": path, "headers": [], "query_string": b""}
+    scope |= {"server": ("localhost", 1), CALLER: Caller("a", "script")}
+    answer = asyncio.run(app._noted(daemon)(Request(scope), error))
+    assert answer.status_code >= 400
+    assert outcomes == [(bytes.fromhex("ab" * 10), outcome) for outcome in logged]

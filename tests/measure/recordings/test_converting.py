@@ -20,7 +20,7 @@ from teds_provision.measure.blocks import Block, GroupRows, InvalidValues, NodeR
 from teds_provision.measure.recordings import converting
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
-from teds_provision.measure.recordings.summary import RecordingSummary
+from teds_provision.measure.recordings.summary import NOTES, RecordingSummary
 from teds_provision.measure.sinks import open_sink
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 from teds_provision.teds.units import parse_units, recognize
@@ -252,3 +252,11 @@ def test_rows_of_a_grid_are_made_as_the_recording_is_read_although_a_stream_has_
         begun.append(taken[0])
     assert begun[-1] == 59
     assert set(range(7, 60)) <= set(begun), "five seconds, and two periods, after its last value"
+
+
+def test_of_very_many_notes_the_first_are_shown() -> None:
+    """How it began to go wrong says more than how it went on."""
+    summary = RecordingSummary()
+    for number in range(2 * NOTES):
+        summary.add_entry(Note(float(number), "The disk was full."))
+    assert [note.at for note in summary.notes] == [float(number) for number in range(NOTES)]

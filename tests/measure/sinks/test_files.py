@@ -680,3 +680,14 @@ def test_a_wide_file_of_another_datasheet_is_a_part_of_its_own(tmp_path: Path) -
     sink.close()
     assert sink.files == (str(path), str(tmp_path / "run.2.csv"))
     assert [len(rows(Path(name).read_text())) for name in sink.files] == [4, 2]
+
+
+def test_a_part_goes_to_the_disk_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    part, synced = Part(tmp_path / "run.csv"), list[float]()
+    began = time.monotonic()
+    monkeypatch.setattr(os, "fsync", lambda _file: synced.append(now))
+    for tenth in range(35):
+        now = began + tenth / 10
+        part.look(now)
+    assert len(synced) == 3
+    part.abandon()

@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, SetPointCommand, StationFacts
+from teds_provision.measure.sinks import names
+from teds_provision.measure.sinks.base import LIVE_WAITING
 from teds_provision.measure.sinks.joints import joints_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.names import Topics, slug
@@ -486,3 +488,34 @@ def test_a_thousand_rows_a_second_go_out_and_no_more(rate: int, every: int) -> N
     rows = GroupRows("crane", ((ARM, 1),), times, np.zeros((100, 1)), np.zeros((100, 1)))
     sink = carried([rows])
     assert [stamp for topic, stamp, *_ in sink.arrays if topic == "/bench/crane"] == times[::every].tolist()
+
+
+def test_a_name_that_others_wish_for_is_given_to_none_of_those_who_would_make_do_with_it() -> None:
+    """Else names would follow from the order in which nodes are known, and change with the next start."""
+    wishes = {1: ("x",), 2: ("x",), 3: ("x_1",), 4: ("x_1",), 5: ("y",), 6: ("taken",)}
+    more = {number: (f"{name}_{number}",) for number, (name,) in wishes.items()}
+    found = names._apart(wishes, more, {"taken"})
+    assert found == {1: "x_1_2", 2: "x_2", 3: "x_1_3", 4: "x_1_4", 5: "y", 6: "taken_6"}
+    backwards = dict(reversed(wishes.items()))
+    assert names._apart(backwards, more, {"taken"}) == found
+
+
+@pytest.mark.parametrize("name", ["unverified", "unverified/arm", "status", "all", "joint_states"])
+def test_no_node_is_called_as_a_part_of_the_stations_own_topics(name: str) -> None:
+    topics = Topics(STATION)
+    topics.learn([ANGLE, FORCE])
+    with pytest.raises(UsageError, match="is the topic of something else already"):
+        topics.require_free(ARM, 0, name)
+    topics.require_free(ARM, 0, "left/arm")
+    with pytest.raises(UsageError, match=f"is the topic of node {HAND} already"):
+        topics.require_free(ARM, 0, topics.node(HAND))
+
+
+def test_a_sink_that_is_closed_takes_nothing_and_so_drops_nothing() -> None:
+    sink = Carrier()
+    sink.open([ANGLE], STATION)
+    sink.close()
+    for _ in range(2 * LIVE_WAITING):
+        sink.write(block())
+    assert sink.stats.dropped == 0
+    assert not sink._items

@@ -417,3 +417,18 @@ def test_under_another_name_of_their_node_all_channels_are_announced_anew_and_it
     assert topics == ["bench/arm/state", *first]
     assert client.published[0][1] == b""
     assert [json.loads(octets)["state_topic"] for _, octets in client.published[1:]] == ["bench/left"] * 2
+
+
+@pytest.mark.parametrize("greeted", [True, False])
+def test_values_that_were_dropped_are_no_failure_of_a_broker_that_took_this_client_once(greeted: bool) -> None:
+    sink, client = desk_sink(ANGLE)
+    client.disconnect = client.loop_stop = lambda: None  # type: ignore[attr-defined]
+    sink._connected.clear()
+    sink._waits("nothing is listening at localhost:1883")
+    if greeted:
+        sink._on_connect(None, None, None, SimpleNamespace(is_failure=False), None)
+        sink._connected.clear()
+    sink._count(dropped=5)
+    sink._finish()
+    assert (sink.stats.error == "") is greeted
+    assert greeted or "accepted nothing: nothing is listening at localhost:1883" in sink.stats.error
