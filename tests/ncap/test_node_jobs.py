@@ -53,6 +53,7 @@ class TappedAtTheEnd(NodeJobs):
         return job
 
     def _wait(self, timeout: float | None = None) -> bool:
+        """Wait for the end; a wait with an end is over at once."""
         if timeout is None:
             self.waited_for.set()
             self.reader.join()
@@ -70,7 +71,7 @@ def test_work_that_began_within_the_time_for_a_tap_is_waited_for() -> None:
         return "written"
 
     try:
-        assert jobs.with_node(NODE, "a datasheet is written", work, wait=0.01) == "written"
+        assert jobs.with_node(NODE, "a datasheet is written", work, wait=PATIENCE) == "written"
     finally:
         jobs.waited_for.set()
 
