@@ -204,13 +204,16 @@ def link_options(function: Function) -> Function:
         named = can[0] if len(can) == 1 else can or None
         chosen = click.get_current_context().get_parameter_source("via") is not ParameterSource.DEFAULT
         here = options_given("nfc", "can", "ble")
+        reader_chosen = "nfc" in here
         if not chosen and (here == {"can"} or (here == {"ble"} and not nfc)):  # naming one link chooses it
             via, chosen = here.pop(), True
         with tracing(trace) as opened, readers_for(via):
             # The setting in config.toml limits the wait for a tap; --timeout on the command line also limits the search
             # here.
             listen = timeout if options_given("timeout") else links.ports.LISTEN_SECONDS
-            settings = links.LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
+            settings = links.LinkSettings(
+                via, nfc or None, named, ble, timeout, opened, listen, chosen, reader_chosen=reader_chosen
+            )
             return function(*args, links=settings, **rest)
 
     options = [

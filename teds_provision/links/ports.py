@@ -406,7 +406,8 @@ class LinkSettings:
 
     ``timeout`` in seconds; ``listen`` is how long a command that collects nodes listens at least: 3 s, or ``--timeout``
     if that was given. ``nfc`` None or ``auto``: the only reader. ``trace`` is an open one (--trace). ``via_chosen``:
-    the kind of link was given, so that no other is searched.
+    the kind of link was given, so that no other is searched. ``reader_chosen`` False: ``nfc`` is a setting of this
+    machine, not an option of this command, so that a node may be elsewhere as well.
     """
 
     via: str = "nfc"
@@ -417,11 +418,12 @@ class LinkSettings:
     trace: Trace | None = None
     listen: float = LISTEN_SECONDS
     via_chosen: bool = False
+    reader_chosen: bool = True
 
     @property
     def names_no_link(self) -> bool:
         """True if neither a link nor a reader was given: any that the node may be on will do."""
-        return self.via == "nfc" and self.nfc is None and not self.via_chosen
+        return self.via == "nfc" and not (self.nfc and self.reader_chosen) and not self.via_chosen
 
     def at(self, place: str) -> LinkSettings:
         """Return the same settings at another place, ``LINK:WHERE``."""

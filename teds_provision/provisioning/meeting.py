@@ -34,6 +34,8 @@ _log = logging.getLogger(__name__)
 _SHOWN = 5
 _TRY_SECONDS = 1.5
 """Seconds to search the last known bus before waiting for a tap (one broadcast round plus margin)."""
+_GLANCE_SECONDS = 0.4
+"""Seconds to look at a configured reader before searching a bus: a node that is on it answers at once."""
 
 
 @contextmanager
@@ -49,7 +51,8 @@ def meet(
 
     Of several nodes on a bus it selects the only one that is not finished yet. ``before`` is called when the link is
     open and the wait has not begun: the time to ask for a passphrase. If no link was chosen, ``uuid`` is searched on
-    the named buses, else on the bus of its last contact, and then at the reader. Raises NoReaderError,
+    the named buses, else on the bus of its last contact, and then at the reader; a reader of config.toml is looked at
+    before the buses too. Raises NoReaderError,
     NoNodeError after ``links.timeout`` seconds, AddressConflictError, UsageError if several nodes qualify.
     """
     if uuid is None:
@@ -73,9 +76,15 @@ def meet(
 
 @contextmanager
 def _met_at(
-    station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter, before: Callable[[], object]
+    station: Station,
+    links: LinkSettings,
+    uuid: bytes,
+    reporter: Reporter,
+    before: Callable[[], object],
+    *,
+    quietly: bool = False,
 ) -> Iterator[Conversation]:
-    """Meet this one node on the one link that ``links`` name."""
+    """Meet this one node on the one link that ``links`` name; ``quietly`` without notices while it is searched."""
 
     def wanted(identity: Identity) -> bool:
         return identity.uuid == uuid
@@ -83,18 +92,23 @@ def _met_at(
     try:
         port = open_port(links)
     except NoReaderError as error:
-        if not links.names_no_link:
+        if links.nfc or not links.names_no_link:
             raise
         raise _no_link(station, uuid, error) from error
     try:
         avoid_measuring_source(station, port, uuid)
         before()
         address = likely_address(station, uuid)
-        contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
+        notice = _ignore if quietly else reporter.notice
+        contact = port.find(wanted, seconds=links.timeout, notice=notice, address=address)
         with Conversation(contact, notice=reporter.notice) as node:
             yield node
     finally:
         port.close()
+
+
+def _ignore(_: Notice) -> None:
+    """Show no notice."""
 
 
 def _met_somewhere(
@@ -106,7 +120,7 @@ def _met_somewhere(
     reporter: Reporter,
     before: Callable[[], object],
 ) -> Conversation:
-    """Meet a node: a short search at each known place, then a tap.
+    """Meet a node: a look at the reader if one is configured, a short search at each known place, then a tap.
 
     Without a reader there is no tap, and the first place gets all the remaining time.
     """
@@ -119,23 +133,28 @@ def _met_somewhere(
             before()
 
     began = time.monotonic()
-    for place in known:
-        there = replace(links.at(place), timeout=min(links.timeout, _TRY_SECONDS))
+    searched = [(links.at(place), _TRY_SECONDS) for place in known]
+    if links.nfc:
+        searched.insert(0, (replace(links, via_chosen=True), _GLANCE_SECONDS))
+    for place, seconds in searched:
+        there = replace(place, timeout=min(links.timeout, seconds))
         try:
-            return stack.enter_context(_met_at(station, there, uuid, reporter, once))
+            return stack.enter_context(_met_at(station, there, uuid, reporter, once, quietly=place.via == "nfc"))
         except (
             NoNodeError,
             NoReaderError,
         ) as error:  # the node is off or elsewhere, or the adapter is not plugged in: go on, a tap may come
-            _log.debug("%s is not at %s: %s", uuid.hex(), place, error.message)
+            _log.debug("%s is not at %s: %s", uuid.hex(), place.places, error.message)
     left = replace(links, timeout=max(0.1, links.timeout - (time.monotonic() - began)))
+    where = " or ".join(place.partition(":")[2] for place in known)
     try:
         return stack.enter_context(_met_at(station, left, uuid, reporter, once))
+    except NoNodeError as error:
+        raise NoNodeError(f"{error.message} It did not answer on {where} either.", hint=error.hint) from error
     except NoReaderError as no_reader:
         try:
             return stack.enter_context(_met_at(station, left.at(known[0]), uuid, reporter, once))
         except NoNodeError as error:
-            where = " or ".join(place.partition(":")[2] for place in known)
             raise NoNodeError(
                 f"Node {uuid.hex()} did not answer on {where} within {links.timeout:g} s, and there is no NFC reader.",
                 hint=error.hint,

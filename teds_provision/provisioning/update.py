@@ -189,7 +189,7 @@ def update_boards(
     """
     places: dict[str, list[tuple[bytes, UpdateOrder]]] = {}
     for uuid, order in orders:
-        known = likely_places(station, links, [uuid])
+        known = _buses_of(station, links, uuid)
         places.setdefault(known[0] if known else "", []).append((uuid, order))
     for place, there in places.items():
         port = open_port(links.at(place) if place else links)
@@ -626,5 +626,10 @@ def _seconds(node: Conversation, octets: int) -> float:
 
 
 def _port_of(station: Station, links: LinkSettings, uuid: bytes) -> Port:
-    known = likely_places(station, links, [uuid])
+    known = _buses_of(station, links, uuid)
     return open_port(links.at(known[0]) if known else links)
+
+
+def _buses_of(station: Station, links: LinkSettings, uuid: bytes) -> tuple[str, ...]:
+    """Return the buses on which to update a board; none if a reader is configured, which is waited at for hours."""
+    return () if links.nfc else likely_places(station, links, [uuid])

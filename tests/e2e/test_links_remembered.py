@@ -66,6 +66,29 @@ def test_a_remembered_bus_prevents_no_tap(desk: Desk, station: Station, node: No
     assert "reader" in agreed["message"], "a key is agreed on by a tap unless a bus is named"
 
 
+def test_a_reader_and_a_bus_of_config_toml_are_both_searched(desk: Desk, station: Station, node: Node) -> None:
+    """Both are stored once; then a board is tapped, mounted, and read on its bus."""
+    station.ask("config", "set", "nfc", desk.links.nfc)
+    station.ask("config", "set", "can", desk.links.can)
+    node.start()
+    assert station.ask("provision", "--profile", ANGLE, "--yes")["verdict"] == "authentic", "by a tap"
+    assert station.ask("verify", node.uuid)["verdict"] == "authentic", "it is still on the reader"
+    node.stop()
+    other = desk.node("other").start()
+    node.start(nfc=False, can=True)
+    done = station.run("--json", "verify", node.uuid)
+    assert done.json["verdict"] == "authentic", "another board is on the reader"
+    assert other.uuid not in done.err, "it is no matter of this command"
+    refused = station.refuses("verify", node.uuid, "--nfc", desk.links.nfc, "--timeout", "1", code=5)
+    assert other.uuid in refused["message"], "a reader that is named is the only one"
+    other.stop()
+    assert station.ask("verify", node.uuid)["verdict"] == "authentic", "nothing is on the reader"
+    node.stop()
+    refused = station.refuses("verify", node.uuid, "--timeout", "1", code=5)
+    assert "was placed on the reader" in refused["message"], "at last a tap is waited for"
+    assert f"did not answer on {desk.links.can}" in refused["message"]
+
+
 def test_an_empty_bus_is_reported_with_the_time_that_was_listened(station: Station) -> None:
     bus = free_bus()
     outcome = station.run("identify", "--can", bus, "--timeout", "1.5")
