@@ -292,7 +292,7 @@ def _misused(arguments: list[str], error: click.ClickException) -> int:
             return _fail(arguments, 2, "usage", f"Missing command. (see: {error.ctx.command_path} --help)", "")
         print(error.format_message(), file=sys.stderr)
         return 2
-    text, hint = error.format_message(), ""
+    text, hint = " ".join(error.format_message().split()), ""  # click lists choices one in a line
     if isinstance(error, click.UsageError) and error.ctx is not None:
         text += f" (see: {error.ctx.command_path} --help)"
     if isinstance(error, click.NoSuchOption) and any(error.option_name in option.opts for option in cli.params):

@@ -65,3 +65,27 @@ def test_with_yes_it_is_reported_and_a_group_without_one_needs_none(measured: Pa
     plain = call(measured, "--json", "group", "delete", "spare")
     assert plain.json == {"groups": []}
     assert call(measured, "group", "delete", "spare").code == 0
+
+
+def test_a_dry_run_shows_the_group_as_it_would_be_and_refuses_what_the_change_refuses(measured: Path) -> None:
+    other = "91aa9da65281f7000000"
+    assert call(measured, "whitelist", "add", ONE.hex(), "--fingerprint", "ab" * 32).code == 0
+    assert call(measured, "whitelist", "add", other, "--fingerprint", "cd" * 32).code == 0
+    for words, uuids in ((("add", "crane", other), [ONE.hex(), other]), (("remove", "crane", ONE.hex()), [])):
+        plan = call(measured, "--json", "group", *words, "--dry-run")
+        assert plan.json["groups"] == [{"name": "crane", "uuids": uuids}]
+    assert call(measured, "--json", "group", "create", "arm", other, "--dry-run").json["groups"] == [
+        {"name": "arm", "uuids": [other]}
+    ]
+    before = [{"name": "crane", "uuids": [ONE.hex()]}, {"name": "spare", "uuids": [ONE.hex()]}]
+    assert call(measured, "--json", "group", "list").json["groups"] == before
+    assert call(measured, "group", "create", "crane", other, "--dry-run").code == 2, "it has other members"
+    with Station.inspect(measured) as store, store.groups.frozen("crane"):
+        assert call(measured, "group", "add", "crane", other, "--dry-run").code == 6, "it is measured"
+
+
+@pytest.mark.parametrize("option", [(), ("--dry-run",)])
+def test_deleting_a_group_that_does_not_exist_says_so(measured: Path, option: tuple[str, ...]) -> None:
+    done = call(measured, "group", "delete", "cranes", *option)
+    assert done.code == 0, "every command can be repeated"
+    assert "there is no group 'cranes'" in done.err

@@ -44,6 +44,8 @@ def test_no_hint_offers_a_profile_that_is_only_a_base(home: Path) -> None:
         (["verify", "none.json"], 3, "There is no file none.json", ""),
         (["sign", "none.json"], 3, "There is no file none.json", ""),
         (["show", "none.json"], 3, "There is no file", ""),
+        (["show", UUID], 3, "There is no file", "nodes UUID"),
+        (["describe", UUID], 2, "Missing option '--as'. Choose from: td, ros2-control, aas", ""),
         (["verify", "hello.txt"], 8, "hello.txt is not a TEDS image", "build, sign and read"),
         (["show", "hello.txt"], 8, "hello.txt holds no TEDS", "Intel HEX"),
         (["import-keys", "hello.txt"], 8, "hello.txt is not a handover bundle", "export-keys"),

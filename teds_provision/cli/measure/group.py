@@ -36,6 +36,34 @@ def list_groups(app: App) -> None:
     _print_groups(app, app.station().groups.all())
 
 
+class _PlannedError(Exception):
+    """Rolls a change back that was tried out."""
+
+    def __init__(self, group: Group) -> None:
+        super().__init__(group.name)
+        self.group = group
+
+
+def _change(app: App, act: str, change: Callable[[Groups], Group], *, dry_run: bool) -> None:
+    """Change a group and print it; ``dry_run`` prints it as it would be, and raises what the change would raise."""
+    station = app.station()
+    with station.lock(f"group {act}", app.note):
+        if not dry_run:
+            _print_groups(app, [change(station.groups)])
+            return
+        try:
+            with station.transaction():
+                raise _PlannedError(change(station.groups))
+        except _PlannedError as planned:
+            app.note("Plan, nothing is changed:")
+            _print_groups(app, [planned.group])
+
+
+def _uuids(app: App, nodes: Sequence[str]) -> list[bytes]:
+    station = app.station()
+    return [station.nodes.resolve(text) for text in nodes]
+
+
 @command("teds-provision group create hand 8d4d 91aa", name="create")
 @click.argument("name")
 @click.argument("nodes", nargs=-1, metavar="[UUID …]")
@@ -43,13 +71,8 @@ def list_groups(app: App) -> None:
 @pass_app
 def create(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
     """Create a group of these nodes."""
-    station = app.station()
-    uuids = [station.nodes.resolve(text) for text in nodes]
-    if dry_run:
-        app.emit({"groups": [{"name": name, "uuids": [uuid.hex() for uuid in uuids]}]}, f"Would create group {name}.")
-        return
-    with station.lock("group create", app.note):
-        _print_groups(app, [station.groups.create(name, uuids)])
+    uuids = _uuids(app, nodes)
+    _change(app, "create", lambda groups: groups.create(name, uuids), dry_run=dry_run)
 
 
 @command("teds-provision group add hand 77f0", name="add")
@@ -59,7 +82,8 @@ def create(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
 @pass_app
 def add(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
     """Add nodes to a group."""
-    _change(app, name, nodes, "add", Groups.add, dry_run=dry_run)
+    uuids = _uuids(app, nodes)
+    _change(app, "add", lambda groups: groups.add(name, uuids), dry_run=dry_run)
 
 
 @command("teds-provision group remove hand 77f0", name="remove")
@@ -69,25 +93,8 @@ def add(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
 @pass_app
 def remove(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
     """Remove nodes from a group."""
-    _change(app, name, nodes, "remove", Groups.remove, dry_run=dry_run)
-
-
-def _change(
-    app: App,
-    name: str,
-    nodes: Sequence[str],
-    act: str,
-    change: Callable[[Groups, str, Sequence[bytes]], Group],
-    *,
-    dry_run: bool,
-) -> None:
-    station = app.station()
-    uuids = [station.nodes.resolve(text) for text in nodes]
-    if dry_run:
-        _print_groups(app, [station.groups.get(name)])
-        return
-    with station.lock(f"group {act}", app.note):
-        _print_groups(app, [change(station.groups, name, uuids)])
+    uuids = _uuids(app, nodes)
+    _change(app, "remove", lambda groups: groups.remove(name, uuids), dry_run=dry_run)
 
 
 @command("teds-provision group delete hand", "teds-provision group delete hand --yes", name="delete")
@@ -104,7 +111,10 @@ def delete(app: App, name: str, *, yes: bool, dry_run: bool) -> None:
     kept = [measurement.id for measurement in station.measurements.of_group(name)]
     what = f"measurement{'s' if len(kept) > 1 else ''} {', '.join(kept)}"
     if dry_run:
-        app.note(f"Would delete group {name}{f' and its {what}' if kept else ''}.")
+        if kept or station.groups.find(name) is not None:
+            app.note(f"Would delete group {name}{f' and its {what}' if kept else ''}.")
+        else:
+            app.note(f"Nothing to do: there is no group {name!r}.")
         _print_groups(app, station.groups.all(), ended=kept)
         return
     asked = yes or (bool(kept) and app.interactive)
@@ -118,6 +128,8 @@ def delete(app: App, name: str, *, yes: bool, dry_run: bool) -> None:
             station.audit("group", None, "deleted", group=name, measurements=list(ended))
     if ended:
         app.note(f"Also deleted: {what}.")
+    if not found:
+        app.note(f"Nothing to do: there is no group {name!r}.")
     _print_groups(app, station.groups.all(), ended=ended)
 
 

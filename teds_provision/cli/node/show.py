@@ -21,7 +21,7 @@ from teds_provision import teds
 from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import ChannelName, FileToRead, command
-from teds_provision.errors import BadDataError, UsageError
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.files import open_to_read, read_limited
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
@@ -122,7 +122,11 @@ def show(
         raise UsageError("--json and --format cannot be combined.", hint="Omit one of them.")
     wanted = cast("Edition", int(edition)) if edition else None
     trusted = tuple(read_limited(path, _MOST_PEM, "certificate") for path in trust_dcc)
-    shown = [load(name, wanted, trusted) for name in files]
+    try:
+        shown = [load(name, wanted, trusted) for name in files]
+    except NotFoundError as error:
+        hint = error.hint or "show decodes files. Of a node: nodes UUID, or read UUID --output FILE."
+        raise NotFoundError(error.message, hint=hint) from error
     if plot is not None:
         if len(shown) != 1:
             raise UsageError("--plot works with one file.", hint="Run show once per file.")
