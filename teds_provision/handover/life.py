@@ -11,6 +11,7 @@ from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.handover.strict_json import is_label
 from teds_provision.provisioning.agree import ResetReceipt
+from teds_provision.provisioning.board_type import WrongBoardError, differences
 from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
@@ -105,7 +106,8 @@ class TakeoverPlan:
 def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration: bool) -> TakeoverPlan:
     """Look at both nodes.
 
-    Raises NotFoundError (OLD unknown, no calibration known), UsageError, NotWhitelistedError (NEW).
+    Raises NotFoundError (OLD unknown, no calibration known), UsageError, NotWhitelistedError (NEW), WrongBoardError (by
+    their last readings NEW is of another type).
     """
     if old == new:
         raise UsageError("A node cannot replace itself.")
@@ -115,7 +117,23 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     station.policy.require_not_given_away(old)
     station.policy.require_whitelisted(new)
     after = station.nodes.get(new) or NodeRecord(new)
-    return TakeoverPlan(before, after, _calibration_of(station, before) if copy_calibration else {})
+    plan = TakeoverPlan(before, after, _calibration_of(station, before) if copy_calibration else {})
+    if not plan.done:
+        _require_same_type(station, old, new)
+    return plan
+
+
+def _require_same_type(station: Station, old: bytes, new: bytes) -> None:
+    """Refuse before OLD is reset: the spare's datasheet could not be written afterwards."""
+    has, wanted = station.datasheets.datasheet(new), station.datasheets.datasheet(old)
+    changes = differences(has.blocks, wanted) if has is not None and wanted is not None else ()
+    if changes:
+        more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
+        raise WrongBoardError(
+            f"Node {new.hex()} is of a different type: {changes[0].rstrip('.')}{more}. Nothing was changed.",
+            changes,
+            hint=f"Name a spare of the same type, or first change its type: provision {new.hex()} --retype",
+        )
 
 
 def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:

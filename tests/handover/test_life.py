@@ -13,6 +13,7 @@ from teds_provision.handover.life import is_finished, plan_takeover, retire, rev
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.agree import ResetReceipt, agree, reset_node
+from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.inventory import inventory
 from teds_provision.provisioning.operator import AcceptingOperator
@@ -201,6 +202,20 @@ def test_a_calibration_is_copied_only_when_told(pair: Pair, tmp_path: Path, copi
     record = pair.north.nodes.get(spare.uuid)
     assert record is not None
     assert record.name == "thermo"
+
+
+def test_a_node_of_another_type_is_no_spare(pair: Pair, tmp_path: Path) -> None:
+    """It was accepted: the old node was reset, and the datasheet could not be written to the other one."""
+    thermometer, finger = calibrated(pair, tmp_path), pair.board
+    provisioned(pair.north, finger, "tactile-finger-sensor")
+    with pytest.raises(WrongBoardError, match=r"is of a different type: Channel 1.*Nothing was changed") as refused:
+        plan_takeover(pair.north, thermometer.uuid, finger.uuid, copy_calibration=False)
+    assert "--retype" in refused.value.hint
+    spare = Board(uuid=bytes.fromhex("8d4d9da65281f700cccc"))
+    key_up(pair.north, spare)
+    plan = plan_takeover(pair.north, thermometer.uuid, spare.uuid, copy_calibration=False)
+    take_over(pair.north, plan, None)
+    assert plan_takeover(pair.north, thermometer.uuid, spare.uuid, copy_calibration=False).done, "it may be repeated"
 
 
 def test_what_cannot_be_replaced(pair: Pair) -> None:

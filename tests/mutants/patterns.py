@@ -1216,6 +1216,9 @@ PATTERNS = (
         "tests/doctor/test_doctor.py",
     ),
     Pattern(
+        "a node of another type is no spare", "plan_takeover", "not plan.done", "False", "tests/handover/test_life.py"
+    ),
+    Pattern(
         "a list that was cut short is a failure",
         "purpose_of",
         "name in _SHOWING and '--output' not in arguments",

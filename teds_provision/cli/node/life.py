@@ -229,5 +229,6 @@ def _takeover(plan: TakeoverPlan) -> tuple[dict[str, Any], str]:
         "calibration_copied": bool(plan.calibration),
     }
     given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
-    text = f"{plan.new.uuid.hex()} takes over from {plan.old.uuid.hex()}"
+    now = f" (now {plan.new.name!r})" if plan.new.name and not plan.done else ""
+    text = f"{plan.new.uuid.hex()}{now} takes over from {plan.old.uuid.hex()}"
     return result, f"{text}: {', '.join(given) or 'no name or profile'}"
