@@ -55,6 +55,7 @@ class FoxgloveSink(ThreadedSink):
         self._published: MeasurementTopics | None = None
         self._topics = Topics(StationFacts(""))
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
+        self._sheets: dict[str, str] = {}  # the topic of each node's datasheet
         self._streams: dict[tuple[str, int, tuple[int, ...], bool], tuple[foxglove.Channel, np.ndarray, int]] = {}
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
@@ -82,17 +83,23 @@ class FoxgloveSink(ThreadedSink):
         if not facts:
             return
         self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
-        self._topics.learn(facts)
+        own = dict.fromkeys(channel_facts.uuid for channel_facts in facts)
+        named = self._topics.learn(facts)
         published = self._published
         assert published is not None
         published.parameters = {
             self._topics.channel(*key): json.dumps(facts_as_json(known)) for key, known in self._facts.items()
         }
-        for uuid in dict.fromkeys(channel_facts.uuid for channel_facts in facts):
+        before = {uuid: topic for uuid, topic in self._sheets.items() if uuid in named}
+        renamed = [uuid for uuid, topic in before.items() if topic != self._topics.of_node(uuid, "teds")]
+        for uuid in renamed:  # a late subscriber must not find the old datasheet there
+            published.latest.pop(before[uuid], None)
+        for uuid in (*own, *(uuid for uuid in renamed if uuid not in own)):
             every = [facts_as_json(known) for known in self._facts.values() if known.uuid == uuid]
-            topic = self._topics.of_node(uuid, "teds")
+            topic = self._sheets[uuid] = self._topics.of_node(uuid, "teds")
             published.latest[topic] = self._text(topic, json.dumps({"uuid": uuid, "channels": every}), time.time())
-        self._streams = {key: value for key, value in self._streams.items() if key[0] not in {f.uuid for f in facts}}
+        anew = own.keys() | set(renamed)
+        self._streams = {key: value for key, value in self._streams.items() if key[0] not in anew}
 
     def _channel(self, topic: str, kind: str, definition: str, metadata: dict[str, str]) -> foxglove.Channel:
         assert self._published is not None

@@ -126,8 +126,9 @@ class FoxgloveServer:
     def repeat(self, topic: str) -> None:
         """Send the last facts of a node again, if ``topic`` is theirs; called from threads of the SDK."""
         for topics in tuple(self._measurements):
-            if topic in topics.latest and topic in topics.channels:
-                topics.channels[topic].log(topics.latest[topic], log_time=time.time_ns())
+            message = topics.latest.get(topic)  # a node that is renamed meanwhile takes it away
+            if message is not None and topic in topics.channels:
+                topics.channels[topic].log(message, log_time=time.time_ns())
 
 
 class MeasurementTopics:

@@ -8,7 +8,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -117,3 +120,38 @@ def test_a_taken_port_is_reported() -> None:
             foxglove_sink(f"foxglove:127.0.0.1:{first.port}").open((ANGLE,), STATION)
     finally:
         first.stop()
+
+
+class DeskServer:
+    """The topics of one measurement, as the server keeps them; mock, no SDK is there. ``logged``: how often each."""
+
+    def __init__(self) -> None:
+        self.latest: dict[str, bytes] = {}
+        self.parameters: dict[str, str] = {}
+        self.logged: Counter[str] = Counter()
+
+    def begin(self) -> DeskServer:
+        """Return the topics."""
+        return self
+
+    def channel(self, topic: str, *_facts: Any) -> Any:
+        """Return what counts the messages on a topic."""
+        return SimpleNamespace(log=lambda _message, **_more: self.logged.update([topic]))
+
+
+def test_a_node_that_another_ones_name_renames_has_datasheet_and_streams_under_its_new_name() -> None:
+    """Its streams went on under the old name, beside values of its channels under the new one."""
+    server, other, third = DeskServer(), "f" * 20, "e" * 20
+    sink = FoxgloveSink(server, own=False)  # type: ignore[arg-type]
+    sink._prepare((ANGLE, replace(ANGLE, uuid=third, node="boom")), replace(STATION, nodes={}))
+    sink._process_item(block())
+    assert set(server.latest) == {"/bench/arm/teds", "/bench/boom/teds"}
+    before = server.logged.copy()
+    sink._process_item((replace(ANGLE, uuid=other),))
+    now = {uuid: f"/bench/arm_{uuid[:8]}" for uuid in (ARM, other)}
+    assert set(server.latest) == {"/bench/boom/teds", *(f"{topic}/teds" for topic in now.values())}
+    assert server.logged["/bench/boom/teds"] == before["/bench/boom/teds"], "nothing of it is new"
+    assert set(server.parameters) == {"/bench/boom/angle", *(f"{topic}/angle" for topic in now.values())}
+    sink._process_item(block())
+    assert server.logged["/bench/arm/stream_0"] == before["/bench/arm/stream_0"] == 3
+    assert server.logged[f"{now[ARM]}/stream_0"] == server.logged[f"{now[ARM]}/angle"] == 3
