@@ -108,10 +108,12 @@ def test_a_bundle_cannot_ruin_a_nodes_sequence(pair: Pair, known: bool) -> None:
     if known:
         pair.take(pair.export("copy")[0])
         session(pair.south, pair.board)
+    before = pair.south.nodes.get(pair.board.uuid)
     lie = node_of(pair.board, sequence=HIGHEST, teds_sha256="ab" * 32)
     taken(pair.south, forged(pair.north, pair.south, lie))
     record = pair.south.nodes.get(pair.board.uuid)
     assert record is not None
+    assert record.teds_sha256 == (before.teds_sha256 if before is not None else "ab" * 32)
     assert record.sequence <= 1
     provisioned(pair.south, pair.board)
     record = pair.south.nodes.get(pair.board.uuid)
@@ -307,6 +309,11 @@ def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, we
     assert plan_removal(pair.south, north).cas == (pair.north.ca,)
     (other,) = (trusted for trusted in pair.south.policy.trusted("station") if trusted.name == "west")
     assert plan_removal(pair.south, other).cas == ()
+    (row,) = (row for row in pair.south.handovers.all() if row.direction == "in")
+    pair.south.handovers.put(replace(row, id=str(uuid4()), peers=(west.fingerprint,)))  # as if west brought it as well
+    assert [plan_removal(pair.south, station).cas for station in (north, other)] == [(), ()]
+    assert remove(pair.south, north).cas == ()
+    assert remove(pair.south, other).cas == (pair.north.ca,)
 
 
 # -- L1, L3: receipts ------------------------------------------------------------------------------------------------

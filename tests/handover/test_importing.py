@@ -155,6 +155,21 @@ def test_a_claimed_key_under_another_ca_does_not_spoil_the_one_in_use(pair: Pair
     assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
 
 
+def test_the_same_key_under_another_ca_leaves_the_ca_as_it_is(pair: Pair) -> None:
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    pair.south.keys.set_ca_of(pair.board.uuid, pair.south.ca)
+    bundle = pair.folder / "lie.jwe"
+    export_bundle(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    plan = plan_import(pair.north, bundle.read_bytes())
+    assert isinstance(plan, ImportPlan)
+    assert [node.decision for node in plan.nodes] == ["same"]
+    import_bundle(pair.north, plan)
+    assert pair.north.keys.ca_of(pair.board.uuid) == pair.north.ca
+    assert session(pair.north, pair.board) == 1
+    assert pair.north.keys.ca_of(pair.board.uuid) == pair.north.ca
+
+
 def test_a_uuid_known_with_another_node_key_is_refused_and_the_rest_comes_in(tmp_path: Path) -> None:
     pair = Pair.make(tmp_path, 2)
     clone = Board(uuid=pair.boards[1].uuid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -12,6 +13,7 @@ import pytest
 
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.station.node_keys import CONFIRM_MAY_ARRIVE
+from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Holder, KeyRecord, NodeRecord, StationRecord
 
@@ -208,6 +210,25 @@ def test_of_the_other_keys_only_a_newer_agreement_of_a_moment_ago_outlives_a_goo
     station.keys.add(a_key(2, "active"), other)
     station.keys.promote(NODE, f"{2:016x}")
     assert [key.key_id for key in station.keys.keys_of(NODE)] == [*[other.key_id] * stays, f"{2:016x}"]
+
+
+def test_the_plant_hears_that_a_node_is_forgotten_with_its_last_key(station: Station) -> None:
+    station.plant.put_record(PlantRecord("11111111-2222-4333-8444-555555555555"))
+
+    def forgot() -> list[int]:
+        reported = [json.loads(text) for _, _, text in station.plant.outbox(9)]
+        return [event["epoch"] for event in reported if event["act"] == "forgot"]
+
+    station.keys.add(a_key(1, "active"), a_key(2))
+    assert station.keys.remove_key(NODE, f"{1:016x}")
+    assert not station.keys.remove_key(NODE, "f" * 16)
+    assert forgot() == []
+    assert station.keys.remove_key(NODE, f"{2:016x}")
+    assert forgot() == [2]
+    station.keys.add(a_key(4, "active"), a_key(3))
+    assert station.keys.remove(NODE) == 2
+    assert station.keys.remove(NODE) == 0
+    assert forgot() == [2, 4], "no key up to the newest is left"
 
 
 def test_a_ca_whose_key_did_not_open_is_forgotten(station: Station) -> None:
