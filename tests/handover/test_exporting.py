@@ -14,6 +14,7 @@ from teds_provision.handover.incoming import ImportPlan, plan_import
 from teds_provision.handover.outgoing import ExportOrder, _of_the_last_run, plan_export
 from teds_provision.handover.pending import BundleNotes, close, find_handover, undo
 from teds_provision.protocol.handover.bundle import open_bundle
+from teds_provision.station.plant.plant import PlantRecord
 from tests.bench import Board, make_station
 from tests.handover.desk import Pair, everything, key_up, provisioned, session, trust
 
@@ -87,6 +88,23 @@ def test_a_key_that_is_due_for_rotation_is_not_handed_over(pair: Pair) -> None:
     undo(pair.north, find_handover(pair.north, exported.plan.id))
     with pytest.raises(PolicyError, match="must be rotated first"):
         plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,)))
+
+
+def test_a_key_that_waits_for_its_proof_holds_back_a_move_and_no_copy(pair: Pair) -> None:
+    pair.north.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=b"no proof", epoch=2)
+    for named in ((pair.board.uuid,), None):
+        (node,) = plan_export(pair.north, ExportOrder(("south",), named, "copy")).nodes
+        assert node.epoch == 1
+    with pytest.raises(PolicyError, match="not settled"):
+        plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,), "move"))
+
+
+def test_the_plant_hears_once_of_what_is_sealed_again(pair: Pair) -> None:
+    pair.north.plant.put_record(PlantRecord("11111111-2222-4333-8444-555555555555"))
+    for _ in range(2):
+        pair.export("copy")
+    events = [json.loads(text) for _, _, text in pair.north.plant.outbox(9)]
+    assert [event["act"] for event in events] == ["gave"]
 
 
 def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) -> None:

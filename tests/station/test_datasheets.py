@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from teds_provision.station.datasheets import packed, unpacked
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import Draft, NodeRecord
+from teds_provision.station.store.records import Draft, NodeReading, NodeRecord
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 
@@ -59,6 +60,53 @@ def test_a_datasheet_that_comes_back_is_the_present_one_again(station: Station) 
     for image in (first, second, first):
         station.datasheets.put(image)
     assert [record.image for record in station.datasheets.whole_history(NODE)] == [first, second, first]
+
+
+@pytest.mark.parametrize(("named", "kept"), [(None, "of the draft"), ("of the node", "of the node")])
+def test_a_draft_that_was_written_gives_its_datasheet_the_profile_and_goes(
+    station: Station, named: str | None, kept: str
+) -> None:
+    image = Image(NODE, {(0, 1): b"x"})
+    station.datasheets.keep_draft(Draft(NODE, image, profile="of the draft"))
+    station.datasheets.keep_datasheet(Image(NODE, {(0, 1): b"another one"}))
+    assert station.datasheets.draft(NODE) is not None
+    station.datasheets.keep_datasheet(image, named)
+    assert [record.profile for record in station.datasheets.history(NODE)] == [kept, None]
+    assert station.datasheets.draft(NODE) is None
+
+
+def test_after_a_restart_a_reading_is_of_its_session_and_no_longer_whole(station: Station) -> None:
+    reading = NodeReading(NODE, "2026-11-27T12:00:00Z", "verify", bytes(8), True, b"digests")
+    assert station.datasheets.keep_reading(reading)
+    station.datasheets.started_anew(NODE, b"12345678")
+    assert station.datasheets.reading(NODE) == replace(reading, c=b"12345678", whole=False)
+    outside = replace(reading, c=None, by="identify")
+    assert not station.datasheets.keep_reading(outside), "one outside a session takes the place of none of a session"
+    assert station.datasheets.keep_reading(reading)
+    assert station.datasheets.reading(NODE) == reading
+
+
+def test_with_its_reading_a_node_that_was_reset_loses_its_firmware_report(station: Station) -> None:
+    station.datasheets.keep_reading(NodeReading(NODE, "2026-11-27T12:00:00Z", "verify", None, False, b""))
+    station.firmware_reports.keep(NODE, bytes(42), in_session=True)
+    station.datasheets.forget_reading(NODE)
+    assert (station.datasheets.reading(NODE), station.firmware_reports.get(NODE)) == (None, None)
+
+
+def test_a_report_in_a_session_is_dated_anew_though_a_hint_said_the_same(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = [f"2026-11-27T12:00:0{second}Z" for second in range(4)]
+    monkeypatch.setattr("teds_provision.station.firmware_reports.utc_now", iter(times).__next__)
+    kept = [
+        station.firmware_reports.keep(NODE, bytes(42), in_session=sealed)
+        for sealed in (False, False, True, True, False)
+    ]
+    assert [(record.in_session, record.at) for record in kept] == [
+        *[(False, times[0])] * 2,
+        *[(True, times[1])] * 3,
+    ]
+    assert station.firmware_reports.keep(NODE, bytes(43), in_session=True).at == times[2]
 
 
 def test_drafts_of_all_nodes_are_listed_and_dropped_one_by_one(station: Station) -> None:

@@ -138,7 +138,19 @@ def test_a_sheet_of_requirements_names_quantities_and_channels() -> None:
     assert [term.text for term in by_quantity.terms] == ["range >= 360 deg", "uncertainty <= 1 deg", "rate >= 1 kHz"]
     assert met(by_quantity, judge(by_quantity, angle()))
     assert not met(by_name, judge(by_name, angle()))
-    assert met(by_name, judge(by_name, angle(name="Joint 3")))
+    for low, result in ((-0.2, True), (0.0, True), (0.2, False)):  # without an operator a range reaches down to it
+        sheet = angle(name="Joint 3", low=low)
+        assert met(by_name, judge(by_name, sheet)) is result
+
+
+def test_of_channels_of_one_name_each_one_has_to_meet_what_is_asked_and_of_a_quantity_one() -> None:
+    by_quantity, by_name = parse_require(REQUIRE, "task.toml")
+    good, bad = (angle(name="Joint 3", low=low, high=low + 2 * math.pi * share).channels[0]
+                 for low, share in ((0.0, 1), (0.2, 0.5)))  # fmt: skip
+    for channels in ((good, bad), (bad, good)):
+        sheet = replace(angle(), channels=channels)
+        assert met(by_quantity, judge(by_quantity, sheet))
+        assert not met(by_name, judge(by_name, sheet))
 
 
 @pytest.mark.parametrize(
