@@ -15,7 +15,7 @@ import pytest
 
 from teds_provision.errors import NotAuthenticError, PolicyError, UsageError
 from teds_provision.files import new_file
-from teds_provision.handover.deny import lift
+from teds_provision.handover.deny import deny, lift
 from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
 from teds_provision.handover.life import revoke
 from teds_provision.handover.outgoing import (
@@ -267,6 +267,21 @@ def test_an_undone_move_does_not_take_an_older_pending_key_for_a_rotation(pair: 
     assert pair.north.keys.rotation_due(pair.board.uuid) is None
 
 
+def test_a_ban_is_bound_to_the_key_that_it_names_and_one_that_names_none_to_the_pinned_one(pair: Pair) -> None:
+    provisioned(pair.north, pair.board)
+    own = pair.north.pins.pinned(pair.board.uuid)
+    for named in (None, own):
+        statement = seal_revocation(
+            pair.north.vault.identity(), uuid=pair.board.uuid, node=named, why="lost", created=datetime.now(UTC)
+        )
+        for key in ("ab" * 32, own):
+            deny(pair.north, statement, key=key)
+            entry = pair.north.policy.revocation(pair.board.uuid)
+            assert entry is not None
+            assert entry.fingerprint == (named or key)
+            pair.north.policy.forgive(pair.board.uuid)
+
+
 # -- M4: trust that is removed ---------------------------------------------------------------------------------------
 
 
@@ -306,7 +321,9 @@ def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, we
     trust(pair.south, west)
     pair.take(pair.export("copy")[0])
     (north,) = (trusted for trusted in pair.south.policy.trusted("station") if trusted.name == "north")
-    assert plan_removal(pair.south, north).cas == (pair.north.ca,)
+    pair.south.keys.set_ca_of(bytes(10), pair.north.ca)
+    removal = plan_removal(pair.south, north)
+    assert (removal.cas, removal.under) == ((pair.north.ca,), 2), "two nodes keep one CA"
     (other,) = (trusted for trusted in pair.south.policy.trusted("station") if trusted.name == "west")
     assert plan_removal(pair.south, other).cas == ()
     (row,) = (row for row in pair.south.handovers.all() if row.direction == "in")

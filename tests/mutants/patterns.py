@@ -5,6 +5,77 @@ from __future__ import annotations
 from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
+    # what a draw of changes found that no test noticed (protocol, station, handover, teds)
+    Pattern(
+        "strangers ask About once a second while a stream runs",
+        "Permission._plain_security",
+        "function in _HELD_BACK",
+        "function == Function.LIST",
+        "tests/protocol/operation/test_claims.py",
+    ),
+    Pattern(
+        "a late Drive message feeds no dead-man",
+        "StreamRole.drive_message",
+        "self._in_time(values.until, channels) and self._can_apply(data)",
+        "self._claims.fed(channels, self._real()) or self._in_time(values.until, channels)",
+        "tests/protocol/operation/test_driving.py",
+    ),
+    Pattern(
+        "what is armed goes with the last claim alone",
+        "StreamRole.claims_ended",
+        "not self._claims.channels_of(session)",
+        "True",
+        "tests/protocol/operation/test_triggers.py",
+    ),
+    Pattern(
+        "the end of another session ends no upload",
+        "ManageFilter.session_ended",
+        "self._upload is not None and self._upload.session is session",
+        "True",
+        "tests/protocol/test_manage.py",
+    ),
+    Pattern(
+        "a failed part is forgotten with its savepoint",
+        "Connection._undo",
+        "block.spoilt",
+        "self._spoilt",
+        "tests/station/test_keys.py",
+    ),
+    Pattern(
+        "a pending key of the proven epoch is obsolete",
+        "NodeKeys.outdated",
+        "other.epoch > record.epoch",
+        "other.epoch >= record.epoch",
+        "tests/station/test_keys.py",
+    ),
+    Pattern(
+        "a station's own ban counts in the plant's view",
+        "bans",
+        "signer != own.station",
+        "True",
+        "tests/plant/test_merged_claims.py",
+    ),
+    Pattern(
+        "the epoch that a node reported holds against a bundle",
+        "_Judge._stale_key",
+        "max(known.epoch if known is not None else 0, active)",
+        "active",
+        "tests/handover/test_importing.py",
+    ),
+    Pattern(
+        "the owner's CA never ends with a station",
+        "_cas_of",
+        "{trusted.point for trusted in station.policy.trusted('ca')} | {station.ca}",
+        "{trusted.point for trusted in station.policy.trusted('ca')}",
+        "tests/handover/test_hostile_stations.py",
+    ),
+    Pattern(
+        "a slope that the uncertainty hides is not reversed",
+        "_opposite",
+        "min(abs(curve.net), abs(before.net))",
+        "max(abs(curve.net), abs(before.net))",
+        "tests/teds/test_guard.py",
+    ),
     # keys and their life (steps, station, handover)
     Pattern("a pending key out of a backup is no rotation", "_activate", "station.keys.restored(uuid)", "False"),
     Pattern(

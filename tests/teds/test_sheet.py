@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from datetime import UTC, datetime
 from fractions import Fraction
 
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
+from teds_provision.errors import BadDataError
 from teds_provision.teds import AccessCode, Sheet
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
@@ -122,6 +124,26 @@ def test_a_name_finds_its_channel_only_if_it_is_alone() -> None:
     assert Sheet.from_blocks(blocks).named(first.name) == first
     blocks[2, AccessCode.NAME] = blocks[1, AccessCode.NAME]
     assert Sheet.from_blocks(blocks).named(first.name) is None
+
+
+def test_a_person_chooses_a_channel_by_a_name_whose_case_counts_only_between_two() -> None:
+    sheet = Sheet.from_blocks(image_of("tactile-finger-sensor").blocks)
+    first, second, *_ = sheet.channels
+    one = replace(sheet, channels=(replace(first, name="Force"), replace(second, name="Angle")))
+    assert one.chosen("force", "x") == one.channels[0]
+    two = replace(sheet, channels=(replace(first, name="Force"), replace(second, name="force")))
+    assert [two.chosen(name, "x") for name in ("Force", "force")] == list(two.channels)
+    for name in ("FORCE", "forces"):
+        with pytest.raises(BadDataError, match="has no channel"):
+            two.chosen(name, "x")
+
+
+def test_a_uuid_of_16_octets_is_that_of_the_node_if_it_ends_in_the_nodes_10() -> None:
+    image = image_of("tactile-finger-sensor")
+    for before, after, codes in ((b"\1" * 6, b"", set()), (b"", b"\1" * 6, {"uuid"})):
+        meta = teds.compose(AccessCode.META, [("UUID", before + image.uuid + after)], edition=2024)
+        sheet = Sheet.from_image(Image(image.uuid, {**image.blocks, (0, AccessCode.META): meta}))
+        assert {finding.code for finding in sheet.findings} & {"uuid"} == codes
 
 
 def test_an_actuator_says_how_it_halts() -> None:
