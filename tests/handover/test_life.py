@@ -42,7 +42,9 @@ def reset(station: Station, board: Board) -> ResetReceipt:
 
 def test_a_revoked_node_gets_nothing_any_more(pair: Pair) -> None:
     done = provisioned(pair.north, pair.board)
+    pair.north.datasheets.keep_draft(Draft(pair.board.uuid, done.image))
     assert revoke(pair.north, pair.board.uuid, "stolen").fresh
+    assert pair.north.datasheets.draft(pair.board.uuid) is None
     assert held(pair.north, pair.board) == []
     assert pair.north.pins.entry(pair.board.uuid) is None
     with talk(pair.board) as node, pytest.raises(PolicyError, match="was revoked: stolen"):

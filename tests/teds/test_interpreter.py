@@ -223,6 +223,24 @@ def test_limits_and_uncertainty_are_stated_in_the_unit_of_the_values() -> None:
     assert interpreter.inputs == (1,)
 
 
+@pytest.mark.parametrize(
+    ("own", "limits"),
+    [
+        ((10.0, 20.0), (10.0, 20.0)),
+        ((-10.0, 400.0), (0.0, 360.0)),
+        ((None, 20.0), (0.0, 20.0)),
+        ((10.0, None), (10.0, 360.0)),
+    ],
+)
+def test_the_narrower_limits_of_channel_and_calibration_count(
+    own: tuple[float | None, float | None], limits: tuple[float, float]
+) -> None:
+    calibration = ANGLE.channels[0].calibration
+    assert calibration is not None
+    narrowed = changed(ANGLE, calibration=replace(calibration, low_limit=own[0], high_limit=own[1]))
+    assert ChannelInterpreter(narrowed, 1).limits == pytest.approx(limits)
+
+
 def test_a_value_beyond_the_limits_by_more_than_the_uncertainty_is_not_valid() -> None:
     interpreter = ChannelInterpreter(LESS_THAN_A_TURN, 1)
     raws = np.array([0, 63750, 65000], dtype=np.uint64)
