@@ -11,8 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadDataError, PolicyError
-from teds_provision.teds.calibration import evaluate, fit_points, left_out, read_calibrations, residuals
+from teds_provision.teds.calibration import (
+    evaluate,
+    fit_points,
+    left_out,
+    load_calibrations,
+    read_calibrations,
+    residuals,
+)
 from teds_provision.teds.calibration.points import Point, points_of, with_point
+from teds_provision.teds.certificate import CertificateChoice
 from teds_provision.teds.profile import load_profile, shipped_profiles
 from teds_provision.teds.units import parse_unit
 from tests.cli.shell import spawn
@@ -68,6 +76,31 @@ def test_what_was_captured_is_what_is_read(pairs: list[tuple[float, float]]) -> 
     assert [(event["raw"], event["value"]) for event in read] == [
         (pytest.approx(raw, rel=1e-7, abs=1e-30), pytest.approx(value, rel=1e-7, abs=1e-30)) for raw, value in pairs
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("op.csv", "raw,value [mm]\n0,0\n4095,110\n"),
+        ("op.toml", 'unit = "mm"\npoints = [[0, 0], [4095, 110]]\n'),
+    ],
+)
+def test_the_caller_names_the_channel_of_a_file_that_names_none(tmp_path: Path, name: str, text: str) -> None:
+    """``--calibration 2=op.csv`` was refused with: say which one this is for."""
+    gripper = load_profile("gripper", [shipped_profiles()])
+    path = tmp_path / name
+    path.write_text(text)
+    found = load_calibrations(path, gripper, CertificateChoice(channel=2))
+    assert found.keys() == {2}
+    assert evaluate(found[2], 4095) == pytest.approx(0.11)
+    with pytest.raises(BadDataError, match=r"gripper has 3 channels: .* --calibration N="):
+        load_calibrations(path, gripper)
+    with pytest.raises(BadDataError, match="channels 1 to 3, not 9"):
+        load_calibrations(path, gripper, CertificateChoice(channel=9))
+    named = tmp_path / f"named-{name}"
+    named.write_text("# channel: 2\n" + text if name.endswith(".csv") else "channel = 2\n" + text)
+    with pytest.raises(BadDataError, match="holds no calibration of channel 3"):
+        load_calibrations(named, gripper, CertificateChoice(channel=3))
 
 
 def test_residuals_of_a_known_line() -> None:

@@ -296,7 +296,7 @@ def load_calibrations(
         octets = read_limited(path, LIMITS.certificate, "certificate", failure=StoreError)
         found = read_certified(octets, str(path), profile, choice)
     else:
-        found = read_calibrations(read_text(path), str(path), profile)
+        found = read_calibrations(read_text(path), str(path), profile, choice.channel if choice is not None else None)
         found = _for_channel(found, choice, str(path))
     return {number: _with_due(calibration, due, str(path)) for number, calibration in found.items()}
 
@@ -357,10 +357,11 @@ def _certified_channel(file: str, profile: Profile, number: int | None) -> Chann
     return channel
 
 
-def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calibration]:
+def read_calibrations(text: str, file: str, profile: Profile, channel: int | None = None) -> dict[int, Calibration]:
     """Read calibrations as :func:`load_calibrations` does, from text.
 
-    The ending of the name ``file`` decides: .toml, .json, .xml for a certificate, else CSV.
+    The ending of the name ``file`` decides: .toml, .json, .xml for a certificate, else CSV. ``channel`` is what a
+    calibration is for that names no channel itself; None: the only one of the profile that can be meant.
     """
     if Path(file).suffix.lower() == CERTIFICATE:
         return read_certified(text.encode(), file, profile)
@@ -373,10 +374,12 @@ def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calib
             orders = _from_csv(read_csv(text, file, CSV_KEYS))
     out: dict[int, Calibration] = {}
     for order in orders:
-        for channel in _channels(order, profile):
-            if channel.number in out:
-                raise order.wrong("channel", f"channel {channel.number} has two calibrations in this file.")
-            out[channel.number] = calibration_of(order, channel)
+        if channel is not None:
+            order.values.setdefault("channel", (channel, order.line))
+        for meant in _channels(order, profile):
+            if meant.number in out:
+                raise order.wrong("channel", f"channel {meant.number} has two calibrations in this file.")
+            out[meant.number] = calibration_of(order, meant)
     return out
 
 
@@ -466,7 +469,8 @@ def _only_channel(order: CalibrationOrder, profile: Profile) -> ChannelProfile:
     """Return the only channel that needs a calibration, or the only one that exists."""
     wanting = [channel for channel in profile.channels if channel.calibration.required] or profile.channels
     if len(wanting) != 1:
-        raise order.wrong("channel", f"{profile.name} has {len(profile.channels)} channels: say which one this is for.")
+        named = f"name the one that it is for, in a line '# channel: N' or as --calibration N={order.file}."
+        raise order.wrong("channel", f"{profile.name} has {len(profile.channels)} channels: {named}")
     return wanting[0]
 
 
