@@ -92,7 +92,7 @@ def test_the_caller_names_the_channel_of_a_file_that_names_none(tmp_path: Path, 
     path.write_text(text)
     found = load_calibrations(path, gripper, CertificateChoice(channel=2))
     assert found.keys() == {2}
-    assert evaluate(found[2], 4095) == pytest.approx(0.11)
+    assert evaluate(found[2], 4095).value == pytest.approx(110), "mm"
     with pytest.raises(BadDataError, match=r"gripper has 3 channels: .* --calibration N="):
         load_calibrations(path, gripper)
     with pytest.raises(BadDataError, match="channels 1 to 3, not 9"):
