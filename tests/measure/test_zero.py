@@ -165,9 +165,12 @@ def test_limits_are_kept_and_the_guard_is_in_force(rig: Rig) -> None:
     refused = rig.ask("calibrate", "zero", "load", 1, code=6)["error"]
     assert "limit" in refused["message"]
     assert "--accept-calibration" in refused["hint"]
-    done = rig.ask("calibrate", "zero", "load", 1, "--accept-calibration", "the hook weighs that much")
+    accepted = "--accept-calibration", "the hook weighs that much"
+    assert not rig.ask("calibrate", "zero", "load", 1, "--dry-run", *accepted)["written"]
+    done = rig.ask("calibrate", "zero", "load", 1, *accepted)
     assert done["written"]
-    assert "accept-calibration" in [entry["act"] for entry in rig.station.ask("log")["entries"]]
+    acts = [entry["act"] for entry in rig.station.ask("log")["entries"]]
+    assert acts.count("accept-calibration") == 1, "a plan is no act"
     load.node.kill()
 
 

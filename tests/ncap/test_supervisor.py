@@ -349,6 +349,10 @@ def test_a_node_that_ended_is_shown_on_unless_it_is_selected_no_more(
         service.measurements._reap(running, job, NODE, 0.0)
         assert NODE in running.membership.members, "it measures"
         done.set()
+        job.lent.add(ended.uuid)
+        service.measurements._reap(running, job, NODE, 0.0)
+        assert NODE in running.membership.members, "it is lent to a writer, and comes back"
+        job.lent.clear()
         monkeypatch.setattr(service.measurements, "_why_not", lambda _running, _uuid, why=why: why)
         service.measurements._reap(running, job, NODE, 0.0)
         assert (running.membership.members, running.past) == ({}, past)
