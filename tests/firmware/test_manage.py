@@ -509,7 +509,9 @@ def test_another_image_begins_no_sooner_than_ten_seconds_after_the_last() -> Non
     assert desk.why(piece(0)) == Reason.BUSY
     desk.now += 0.1
     assert desk.manage(piece(0)).ok
-    assert desk.manage(piece(0)).ok
+    desk.now += 9.9
+    assert desk.manage(piece(0)).ok, "the same image begins again at once, and its ten seconds with it"
+    desk.now += 9.9
     assert desk.why(piece(0, sha=OTHER)) == Reason.BUSY
     assert desk.manage(piece(40)).ok
     desk.firmware.answer = {"off": 1000, "match": True}

@@ -221,6 +221,20 @@ def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
     assert (counts.good, counts.lost, counts.bad, scene.heard.pieces.wrong) == (3, 0, 0, 0)
 
 
+def test_what_came_before_its_stream_was_opened_is_of_a_run_before() -> None:
+    scene, port = Scene(ago=-60, fd=False), SilentBus()
+    pieces = port.open_stream(0x21, 0, scene.plan.length)
+    frames = frames_of(scene, 2)
+    half = len(frames) // 2
+    before = [replace(frame, at=time.monotonic() - 5.0) for frame in frames[:half]]
+    with port.listen() as listener:
+        port.frames = before
+        assert listener.get_all(0.0) == []
+        port.frames = [replace(frame, at=time.monotonic()) for frame in frames[half:]]
+        assert [message.octets for message in listener.get_all(0.0)] == [scene.message(1)]
+    assert pieces.wrong == 0
+
+
 class Meanwhile(dict[tuple[int, int], Any]):
     """A table in which something happens beside each search."""
 

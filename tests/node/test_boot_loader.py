@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from teds_provision.errors import BadDataError, NotAuthenticError, StoreError
 from teds_provision.firmware_image import FirmwareImage, load_firmware_image
 from teds_provision.node.firmware import boot_loader
 from teds_provision.node.firmware.boot_loader import ImageSlots
+from teds_provision.node.firmware.manager import ImageManager
 from tests.firmware_images import make_key, sign
 
 
@@ -120,6 +122,26 @@ def test_the_security_counter_stops_an_older_image_and_nothing_else_does(owner: 
     assert state(started(folder)) == ("1.5.0", True, False), (
         "an older version with the same counter is the owner's matter"
     )
+
+
+def test_an_image_that_was_uploaded_whole_can_be_uploaded_again(owner: Owner, folder: Path) -> None:
+    """It begins at 0: what was written may have been overwritten since."""
+    manager, octets = ImageManager(started(folder), lambda: None), owner.new.octets
+    whole = {"len": len(octets), "sha": hashlib.sha256(octets).digest()}
+    for _ in range(2):
+        half = len(octets) // 2
+        assert manager._upload({"off": 0, "data": octets[:half], **whole}) == {"off": half}
+        assert manager._upload({"off": 0, "data": octets[:half], **whole}) == {"off": half}, "it was lost on the way"
+        assert manager._upload({"off": half, "data": octets[half:]}) == {"off": len(octets), "match": True}
+
+
+def test_the_counter_does_not_fall_with_the_image_that_runs(owner: Owner, folder: Path) -> None:
+    """Somebody put an older image into the slot that runs."""
+    boot_loader._write_state(folder / boot_loader.FOLDER, boot_loader.BootState(counter=9))
+    slots = started(folder)
+    put(slots, owner.new)
+    assert slots.start_next(owner.new.digest)
+    assert state(started(folder)) == ("1.0.0", False, False)
 
 
 def test_the_counter_rises_only_by_an_image_that_was_confirmed(owner: Owner, folder: Path) -> None:

@@ -198,6 +198,20 @@ def test_a_board_on_trial_is_not_decommissioned_before_it_has_ended(bench: Updat
     assert bench.station.firmware_reports.get(bench.uuid) is None, "the next owner's board is another one"
 
 
+def test_a_button_on_trial_ends_the_trial_before_it_resets(bench: UpdateBench, owner: Owner) -> None:
+    """An image on trial changes nothing stored; the one that was kept does."""
+    slots = bench.node._slots
+    assert slots is not None
+    slots.write(0, owner.new.octets)
+    slots.flush()
+    assert slots.start_next(owner.new.digest)
+    bench.node.restart()
+    assert bench.runs == (owner.new.version_text, True, False)
+    bench.node.reset_by_hand()
+    assert bench.runs == (owner.old.version_text, False, False)
+    assert bench.node.in_factory_state()
+
+
 def test_a_board_that_never_returns_is_lost_and_the_same_call_goes_on_later(bench: UpdateBench, owner: Owner) -> None:
     bench.node.when_restarted(lambda: setattr(bench, "present", False))
     done = bench.update(owner.new, wait=0.5)

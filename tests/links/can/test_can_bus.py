@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -26,6 +27,20 @@ def test_bus_off_is_a_link_failure_that_names_the_cure() -> None:
             bus.receive(1)
     bus.close()
     assert "restart" in failure.value.hint
+
+
+def test_a_frame_that_another_sends_later_is_no_echo_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each echo counts once, for three seconds; some never come."""
+    clock, ours, sent = [100.0], Frame(0x18DA21F1, b"a"), bus_module.SentFrames()
+    monkeypatch.setattr(bus_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    sent.sent(ours)
+    clock[0] += 2.0
+    sent.sent(ours)
+    clock[0] += 2.0
+    assert [sent.discard_echo(ours) for _ in range(2)] == [True, False], "that of the first never came"
+    sent.sent(ours)
+    clock[0] += 4.0
+    assert not sent.discard_echo(ours)
 
 
 def test_hears_extended_data_frames_alone() -> None:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable
+from queue import Empty
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -44,6 +48,29 @@ def test_unexpected_flow_controls_do_not_pile_up(hub: Hub) -> None:
         assert port.bus().address_pair(0x21).flows.empty()
     finally:
         port.close()
+
+
+@pytest.mark.parametrize(("after", "goes_on"), [(0.9, True), (1.1, False)])
+def test_a_wait_gives_the_node_one_more_second(monkeypatch: pytest.MonkeyPatch, after: float, goes_on: bool) -> None:
+    """Also where less than that was left for its flow control."""
+    clock, coming = [100.0], [(0.4, WAIT), (after, CONTINUE)]
+
+    def next_of(_flows: object, seconds: float) -> bytes:
+        comes, data = coming.pop(0)
+        clock[0] += min(comes, seconds)
+        if comes > seconds:
+            raise Empty
+        return data
+
+    monkeypatch.setattr(link_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    bus: Any = SimpleNamespace(spec=SimpleNamespace(fd=False), next_of=next_of)
+    line: Any = SimpleNamespace(flows=None, node=0x21)
+    exchange = link_module._Exchange(bus, line, LONG, 1, 5.0, prompt=False, hopeless=lambda: False)
+    if goes_on:
+        assert exchange._flow(0.5, math.inf, begun=True)[0] == 1
+    else:
+        with pytest.raises(link_module._NoFlowControlError):
+            exchange._flow(0.5, math.inf, begun=True)
 
 
 def test_a_node_that_says_wait_for_ever_is_given_up(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
