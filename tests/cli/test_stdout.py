@@ -6,9 +6,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from teds_provision.cli import stdout
 from teds_provision.sanitize import printable, sanitize, sanitize_json
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
@@ -156,3 +159,14 @@ os.abort()
         )
     assert done.stdout.endswith("0 (0, 0)\n"), done
     assert [path.name for path in tmp_path.glob("core*")] == []
+
+
+@pytest.mark.parametrize(
+    ("code", "only_shows", "done", "ends"), [(0, False, True, 7), (4, False, False, 4), (0, True, False, 7)]
+)
+def test_work_that_failed_is_not_called_done(
+    capsys: pytest.CaptureFixture[str], code: int, only_shows: bool, done: bool, ends: int
+) -> None:
+    output: Any = SimpleNamespace(failure="No space left on device")
+    assert stdout.ended(code, output, purpose=lambda: stdout.Purpose(only_shows, must_print=True)) == ends
+    assert ("The work is done" in capsys.readouterr().err) is done

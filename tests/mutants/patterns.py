@@ -1741,14 +1741,14 @@ PATTERNS = (
         "deny",
         "station.plant.joined is not None",
         "False",
-        "tests/plant/test_parcels.py",
+        "tests/plant/test_sync_files.py",
     ),
     Pattern(
         "a lifting ends bans of bundles",
         "_fold_page",
         "event.hash_of_statement(ban.statement) in lifted",
         "False",
-        "tests/plant/test_parcels.py",
+        "tests/plant/test_sync_files.py",
     ),
     Pattern(
         "what another sender never proved stays",

@@ -8,6 +8,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import cantools
@@ -21,7 +22,7 @@ from teds_provision.links.can.spec import parse_spec
 from teds_provision.node import node_template
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.sources.base import Reading
-from teds_provision.node.wrapped import dbc_message
+from teds_provision.node.wrapped import dbc_message, latest_values
 from teds_provision.node.wrapped.can_reader import CanReader, MessageReader
 from teds_provision.node.wrapped.dbc_message import DbcMessage, pgn_of
 from teds_provision.node.wrapped.description import WrappedChannel, written_unit
@@ -197,6 +198,17 @@ def test_reasons_and_their_order() -> None:
     assert values.at(1.05)[1].endswith(": the bus is gone")
 
 
+@pytest.mark.parametrize(("passed", "late"), [(0.03, False), (0.039, False), (0.041, True)])
+def test_a_value_is_late_once_a_frame_would_have_been_read(
+    monkeypatch: pytest.MonkeyPatch, passed: float, late: bool
+) -> None:
+    """A frame may have come that the thread which reads had no time for yet."""
+    values = reader("Torque").values[0]
+    values.put(1.0, 1000.0)
+    monkeypatch.setattr(latest_values, "time", SimpleNamespace(monotonic=lambda: 1.0 + passed))
+    assert (values.at(1.031)[0] is None) is late
+
+
 def test_a_frame_that_cannot_be_decoded_is_counted_and_changes_nothing() -> None:
     messages: list[str] = []
     supply = reader("Supply", messages)
@@ -216,11 +228,22 @@ def test_a_channel_reports_when_it_becomes_invalid_and_valid_again() -> None:
     values[0].put(1.1, 5)
     assert source.at(1, 1.11) is not None
     assert source.at(1, 9.0) is None
+    values[0].note_trouble("the bus is gone")
+    assert source.at(1, 9.1) is None, "a new reason alone is no news"
     assert [(channel, name, bool(why)) for channel, name, why in events] == [
         (1, "torque", True),
         (1, "torque", False),
         (1, "torque", True),
     ]
+
+
+def test_that_a_channel_is_valid_from_the_start_is_no_news() -> None:
+    events: list[tuple[int, str, str]] = []
+    values = reader("Torque").values
+    source = WrappedSource(values, lambda *event: events.append(event))
+    values[0].put(1.0, 5)
+    assert source.at(1, 1.0) is not None
+    assert events == []
 
 
 def test_what_cannot_be_wrapped_is_refused_by_name(tmp_path: Path) -> None:

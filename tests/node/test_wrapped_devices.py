@@ -158,7 +158,7 @@ def test_a_device_that_is_not_there_is_looked_for_until_it_comes(bus: str) -> No
 def test_options_of_a_canopen_run(bus: str) -> None:
     origin = describe(f"eds:{EDS}").origin
     require_match(SensorPlace(f"canopen:{EDS}", bus, (5, 6)), [origin, origin], ["a", "b"])
-    for node_ids in ((), (5,)):
+    for node_ids in ((), (5,), (5, 6, 7)):
         with pytest.raises(UsageError, match="--node-id"):
             require_match(SensorPlace(f"canopen:{EDS}", bus, node_ids), [origin, origin], ["a", "b"])
 

@@ -28,7 +28,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim.node import Tim
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.image import SECURITY
 
 from .desk import CA, META, NAME, NODE, STATION, UUID, Desk, digest
@@ -353,6 +353,14 @@ def test_a_meta_teds_of_another_node_gets_9_but_a_2024_uuid_is_not_compared(desk
     assert desk.commit({(0, 1): foreign}) == refusal(Reason.WRONG_UUID)
     new_form = frame(bytes.fromhex("030500ff0102010410") + bytes(16))
     assert desk.commit({(0, 1): new_form}).ok
+
+
+def test_no_extra_field_comes_twice_or_behind_a_later_one(desk: Desk) -> None:
+    body = unframe(resigned(desk, extra={112: b"ours", 113: b"ours"}))
+    for field in (112, 111):
+        changed = body.replace(b"\x71\x04ours", bytes([field, 4]) + b"ours")
+        assert changed != body
+        assert desk.commit(BLOCKS, frame(changed)) == refusal(Reason.BAD_FORM)
 
 
 def test_extra_fields_are_covered_by_the_signature(desk: Desk) -> None:

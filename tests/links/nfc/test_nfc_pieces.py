@@ -129,6 +129,18 @@ def test_a_piece_fills_its_message_and_never_more(max_ndef: int, others: int) ->
     assert max_ndef - 3 <= whole <= max_ndef
 
 
+@pytest.mark.parametrize("others", [0, 7])
+def test_no_octet_more_fits_beside_a_piece(others: int) -> None:
+    """Beyond 255 octets the length of a record takes three octets more."""
+
+    def whole(octets: int) -> int:
+        return len(message.encode([tnep.payload_record(Piece(1, 0xFFFF, 0, bytes(octets)).encode())])) + others
+
+    for max_ndef in range(280, 330):
+        octets = room(max_ndef, others)
+        assert whole(octets) <= max_ndef < whole(octets + 1)
+
+
 def run(requester: Requester, responder: Responder, node_room: int) -> bytes:
     for _ in range(requester.steps_allowed + 70_000):
         asked = Piece.decode(requester.next().encode())
@@ -185,6 +197,14 @@ def test_a_reply_of_another_transaction_is_dropped() -> None:
     assert requester.reply == b"ok"
 
 
+def test_a_piece_of_a_reply_that_comes_again_is_taken_once() -> None:
+    requester = Requester(5, b"abcd", 30)
+    for _ in range(2):
+        requester.handle_piece(Piece(5, 5, 0, b"xyz", answer=True, more=True))
+    requester.handle_piece(Piece(5, 5, 3, b"uv", answer=True))
+    assert requester.reply == b"xyzuv"
+
+
 def test_a_request_for_more_repeats_transaction_and_offset_with_an_empty_body() -> None:
     requester = Requester(5, b"abcd", 30)
     requester.handle_piece(Piece(5, 5, 0, b"xyz", answer=True, more=True))
@@ -195,7 +215,26 @@ def test_the_answer_to_a_piece_of_a_request_says_what_is_held() -> None:
     responder = Responder(lambda transaction, whole: whole)
     assert responder.answer(Piece(9, 6, 0, b"abc", more=True), 50) == Piece(9, 6, 3, b"", answer=True)
     assert responder.answer(Piece(9, 6, 5, b"f"), 50) == Piece(9, 6, 3, b"", answer=True)  # a gap
+    for transaction, total, held in ((8, 6, 0), (9, 7, 0), (9, 6, 3)):
+        asked = Piece(transaction, total, 0, b"")
+        assert responder.answer(asked, 50) == Piece(transaction, total, held, b"", answer=True)
     assert responder.answer(Piece(9, 6, 3, b"def"), 50) == Piece(9, 6, 0, b"abcdef", answer=True)
+
+
+def test_a_request_that_begins_again_is_put_together_anew_and_run_again() -> None:
+    """Whether it was the same is for whom the whole frame goes to."""
+    seen: list[bytes] = []
+
+    def serve(_transaction: int, whole: bytes) -> bytes:
+        seen.append(whole)
+        return b"ok"
+
+    responder = Responder(serve)
+    for first, last in ((b"abc", b"def"), (b"uvw", b"xyz")):
+        assert responder.answer(Piece(9, 6, 0, first, more=True), 50) == Piece(9, 6, 3, b"", answer=True)
+        for _ in range(2):
+            assert responder.answer(Piece(9, 6, 3, last), 50) == Piece(9, 2, 0, b"ok", answer=True)
+    assert seen == [b"abcdef", b"abcdef", b"uvwxyz", b"uvwxyz"]
 
 
 @pytest.mark.parametrize(

@@ -5,27 +5,34 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import nfc.tag
 import pytest
 
 from teds_provision.errors import GarbledError
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
-from teds_provision.links.nfc.tag import ReaderTag, Type4Ndef
+from teds_provision.links.nfc.tag import NfcpyType4Ndef, ReaderTag, Type4Ndef, _frame_limits
 from teds_provision.node.nfc.tags import NdefApplication, Type4Memory
 
 
 class Tag:
-    """The NDEF application of a node, in memory; ``strict``: it lets nobody read beyond its message."""
+    """The NDEF application of a node, in memory.
+
+    ``strict``: it lets nobody read beyond its message; ``mute``: its next answer is lost.
+    """
 
     def __init__(self) -> None:
         self.memory = Type4Memory(2000)
         self.application = NdefApplication(self.memory, lambda seconds: True)
-        self.strict = False
+        self.strict = self.mute = False
         self.reads: list[tuple[int, int]] = []
 
     def send_apdu(self, cla: int, ins: int, p1: int, p2: int, data: bytes | None = None, mrl: int = 0) -> bytearray:
         offset = p1 << 8 | p2
         if ins == 0xB0:
             self.reads.append((offset, mrl))
+        if self.mute:
+            self.mute = False
+            raise Type4TagCommandError(nfc.tag.TIMEOUT_ERROR)
         end = 2 + int.from_bytes(self.memory.read(b"\xe1\x04", 0, 2) or b"", "big")
         if self.strict and ins == 0xB0 and offset + mrl > end:
             raise Type4TagCommandError.from_status(b"\x67\x00")
@@ -98,3 +105,45 @@ def test_a_message_that_the_tag_cannot_hold_is_not_written(octets: int, writeabl
     tag._ndef.is_writeable = True
     tag.write(bytes(100))
     assert tag._ndef.octets == bytes(100)
+
+
+def test_a_lost_answer_does_not_end_the_quick_way() -> None:
+    tag = Tag()
+    ndef = written(tag, answer=b"a" * 78)
+    tag.mute = True
+    assert ndef._read_ndef_data() == b"a" * 78
+    tag.reads.clear()
+    ndef._write_ndef_data(bytearray(b"request"))
+    assert ndef._read_ndef_data() == b"a" * 78
+    assert tag.reads == [(0, 80)]
+
+
+def test_a_file_is_selected_again_after_one_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tag then has none open, or still the one before."""
+    asked: list[bytes] = []
+    monkeypatch.setattr(NfcpyType4Ndef, "_select_fid", lambda self, fid: asked.append(fid) or fid == b"\xe1\x04")
+    ndef = Type4Ndef.__new__(Type4Ndef)
+    assert [ndef._select_fid(fid) for fid in (b"\xe1\x04", b"\xe1\x04", b"\xe1\x09", b"\xe1\x04")] == [
+        True,
+        True,
+        False,
+        True,
+    ]
+    assert asked == [b"\xe1\x04", b"\xe1\x09", b"\xe1\x04"]
+
+
+@pytest.mark.parametrize(
+    ("ats", "limits"),
+    [
+        ("0578 80 b0 00", (8, 11)),
+        ("0468 b0 00", (8, 11)),
+        ("0375 80", (5, 4)),  # announces TB(1), and ends before it
+        ("0225", (5, 4)),
+        ("0205", (5, 4)),
+        ("01", (2, 4)),
+        ("", (2, 4)),
+    ],
+)
+def test_an_answer_to_select_may_leave_any_part_out(ats: str, limits: tuple[int, int]) -> None:
+    """ISO/IEC 14443-4, 5.2: a format octet, which names those of TA(1), TB(1) and TC(1) that follow."""
+    assert _frame_limits(bytes.fromhex(ats)) == limits
