@@ -333,7 +333,8 @@ def purpose_of(arguments: list[str]) -> Purpose:
     Any other has done its work all the same.
     """
     name = _command_name(arguments)
-    only_shows = not name or (name in _SHOWING and "--output" not in arguments)
+    writes = any(word.startswith(("--output", "-o")) for word in arguments)
+    only_shows = not name or (name in _SHOWING and not writes)
     return Purpose(only_shows, must_print=only_shows or _wants(arguments, "--json"))
 
 

@@ -72,13 +72,17 @@ def test_json_that_a_full_disk_does_not_take_is_7_after_the_work(home: Path, run
         ("--help", 7),
         ("", 7),
         (f"whitelist remove {UUID.hex()} --yes", 0),
+        (f"label {UUID.hex()} -o FOLDER/label.svg", 0),
+        (f"label {UUID.hex()} --output=FOLDER/label.svg", 0),
         ("nodes 1234", 3),
     ],
 )
-def test_a_list_that_a_full_disk_does_not_take_is_7(home: Path, run: str, words: str, code: int) -> None:
+def test_a_list_that_a_full_disk_does_not_take_is_7(
+    home: Path, run: str, words: str, code: int, tmp_path: Path
+) -> None:
     """What was called for its output alone has done nothing: a file that was cut short is no list."""
-    assert call(home, "whitelist", "add", UUID.hex()).code == 0
-    done = shell(f"{run} {words} >/dev/full")
+    assert call(home, "whitelist", "add", UUID.hex(), "--fingerprint", "ab" * 32).code == 0
+    done = shell(f"{run} {words.replace('FOLDER', str(tmp_path))} >/dev/full")
     assert done.returncode == code, done.stderr
     assert ("could not be written to stdout: No space left" in done.stderr) == (code != 3)
     assert ("The work is done" in done.stderr) == (code == 0), "only a command that changes something has done it"

@@ -35,6 +35,7 @@ FORMS: Final = ("td", "ros2-control", "aas")
 )
 @click.option(
     "--output",
+    "-o",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path(),
     show_default="the working folder",

@@ -273,6 +273,7 @@ def _one(node: dict[str, Any]) -> None:
 @click.argument("uuid")
 @click.option(
     "--output",
+    "-o",
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.svg|png",

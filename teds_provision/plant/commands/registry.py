@@ -61,7 +61,7 @@ def _change_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         dry_run_option,
         yes_option,
-        click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to a new file."),
+        click.option("--output", "-o", type=_FILE, metavar="FILE", help="Also write the signed roster to a new file."),
         click.option("--draft", type=_FILE, metavar="FILE", help="Only write a draft; sign it where the CA key is."),
     ):
         function = option(function)
@@ -152,7 +152,7 @@ def _time(when: Any) -> str:
 @click.option(
     "--days", type=WholeNumber(1, 400), default=90, show_default=True, metavar="DAYS", help="Validity of the roster."
 )
-@click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to a new file.")
+@click.option("--output", "-o", type=_FILE, metavar="FILE", help="Also write the signed roster to a new file.")
 @yes_option
 @dry_run_option
 @pass_app
@@ -187,7 +187,7 @@ def _past(past: Sequence[Any]) -> str:
 
 
 @command("teds-provision registry request --output south.request", name="request")
-@click.option("--output", type=_FILE, required=True, metavar="FILE", help="Where to write the request.")
+@click.option("--output", "-o", type=_FILE, required=True, metavar="FILE", help="Where to write the request.")
 @pass_app
 def request(app: App, output: Path) -> None:
     """Write this station's membership request.
@@ -332,7 +332,7 @@ def _named(how: dict[str, Any]) -> dict[str, Any]:
 
 @command("teds-provision registry sign roster.draft --output roster.jws", name="sign")
 @click.argument("file", type=FileToRead())
-@click.option("--output", type=_FILE, required=True, metavar="FILE", help="Where to write the signed roster.")
+@click.option("--output", "-o", type=_FILE, required=True, metavar="FILE", help="Where to write the signed roster.")
 @yes_option
 @dry_run_option
 @pass_app
