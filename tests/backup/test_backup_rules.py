@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,9 +15,11 @@ from teds_provision.backup.backup import backup
 from teds_provision.backup.content import BackupHead
 from teds_provision.backup.restore import rebuild
 from teds_provision.errors import PolicyError, StoreError, StoreLockedError, UsageError
-from teds_provision.station.station import Station
+from teds_provision.station.station import Station, rewrap
 from teds_provision.station.store.lock import StoreLock
+from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, opened, restored_into
 
 
@@ -70,6 +73,25 @@ def test_a_backup_that_does_not_open_again_is_not_kept(
         back_up(station, tmp_path / "b")
     assert list(tmp_path.glob("*b")) == []
     assert station.audit_log.check().count == 1 + 1  # init and ready
+
+
+def test_a_backup_beside_a_change_of_the_master_key_is_written_again(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, changes = station.rows, iter([True])
+
+    def rows_after_a_change() -> Iterator[bytes]:
+        if next(changes, False):  # the vault's secrets are taken already
+            forget_vaults()  # as another process has it
+            with Station.open(station.home, ask=ask) as other:
+                rewrap(other)
+        return rows()
+
+    monkeypatch.setattr(station, "rows", rows_after_a_change)
+    assert back_up(station, tmp_path / "b").warnings == ()
+    with opened(tmp_path / "b") as content:
+        assert list(content.unopened(station.vault)) == []
+        assert Material.decode(content.material).masters.keys.keys() == {2}
 
 
 def test_the_age_of_a_backup() -> None:

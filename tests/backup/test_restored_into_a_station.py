@@ -141,6 +141,32 @@ def test_a_node_that_was_pinned_again_keeps_its_new_key(station: Station, tmp_pa
     assert "whitelist entries pinned to another key now: 1" in done.kept
 
 
+def test_a_board_that_was_unpinned_since_gets_its_key_from_a_newer_backup_alone(
+    station: Station, tmp_path: Path
+) -> None:
+    station.nodes.put(NodeRecord(NEW, POINT))
+    stale = tmp_path / "stale"
+    with copy_of(station, tmp_path) as older:
+        stale.mkdir(mode=0o700)
+        place(older.copy, stale)
+        station.pins.unpin(NEW)
+        station.audit("whitelist", NEW, "unpinned")
+        assert merge(station, older, dry_run=False).relation is Relation.OLDER
+        known = station.nodes.get(NEW)
+        assert known is not None
+        assert known.point is None
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
+    with Station.open(stale, ask=ask) as behind:
+        behind.pins.unpin(NEW)
+        station.nodes.put(NodeRecord(NEW, POINT))
+        back_up(station, tmp_path / "b")
+        with opened(tmp_path / "b") as newer:
+            assert merge(behind, newer, dry_run=False).relation is Relation.NEWER
+        pinned = behind.nodes.get(NEW)
+        assert pinned is not None
+        assert pinned.point == POINT
+
+
 def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_path: Path) -> None:
     home, stale = station.home, tmp_path / "stale"
     with copy_of(station, tmp_path) as content:
