@@ -167,6 +167,19 @@ def test_a_board_that_was_unpinned_since_gets_its_key_from_a_newer_backup_alone(
         assert pinned.point == POINT
 
 
+def test_a_ca_that_counts_again_stays_so_after_an_older_backup(station: Station, tmp_path: Path) -> None:
+    ca = SoftwareKey.generate().point
+    station.policy.end_ca(ca)
+    station.audit("trust", None, "removed")
+    with copy_of(station, tmp_path) as older:
+        merge(station, older, dry_run=False)
+        assert not station.policy.counts(ca)
+        station.policy.renew_ca(ca)
+        station.audit("trust", None, "added")
+        assert merge(station, older, dry_run=False).relation is Relation.OLDER
+    assert station.policy.counts(ca)
+
+
 def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_path: Path) -> None:
     home, stale = station.home, tmp_path / "stale"
     with copy_of(station, tmp_path) as content:
@@ -187,6 +200,7 @@ def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_
     assert (known.epoch, known.sequence) == (2, 9)
     assert next(key for _, _, key in keys_of(old, ONE)) == new_key
     assert [state for _, state, _ in keys_of(old, ONE)] == ["pending", "active"]  # an Open decides
+    assert [key.source for key in old.keys.keys_of(ONE)] == ["import", "agreement"], "of an agreement here nobody knows"
     assert old.policy.tombstone(TWO) is not None
     assert old.keys.holders(ONE)[0].fingerprint == "cd" * 32
     assert old.audit_log.check().intact

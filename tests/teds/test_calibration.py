@@ -269,6 +269,9 @@ def test_an_overdue_calibration_is_warned_about() -> None:
     assert not replace(old, interval=None).overdue(now)
     assert replace(old, date=now).date_warnings(now) == []
     assert "future" in replace(old, date=now + timedelta(days=3)).date_warnings(now)[0]
+    assert replace(old, date=now + timedelta(hours=23)).date_warnings(now) == [], "today, in another zone"
+    recent = replace(old, date=now - timedelta(days=100), interval=365 * 86400.0).date_warnings(now, 30 * 86400.0)
+    assert [text.partition(" days")[0] for text in recent] == ["its interval of 365"], "its own interval decides"
     assert "no date" in SPLINE.date_warnings(now)[0]
     assert "due again" in replace(old, interval=None).date_warnings(now, 30 * 86400.0)[0]
     assert "longer than" in replace(old, date=now).date_warnings(now, 30 * 86400.0)[0]

@@ -316,6 +316,7 @@ def test_a_large_change_and_a_lost_calibration_are_reported(tactile: Profile) ->
     assert "up to 2 N (20 % of the range)" in text(findings, "changed")
     gone = check_calibration(tactile.build(UUID).blocks, built(tactile, force_line()), tactile)
     assert codes(gone, "warning") == {"removed"}
+    assert codes(check_calibration({}, built(tactile, force_line())), "warning") == {"removed"}
 
 
 def test_an_overdue_calibration_is_reported_if_the_time_is_given(tactile: Profile) -> None:
