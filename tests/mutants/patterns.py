@@ -1922,6 +1922,27 @@ PATTERNS = (
         "False",
         "tests/provisioning/test_update.py",
     ),
+    Pattern(
+        "a piece of a reply is taken once",
+        "Requester._take_reply",
+        "piece.offset == len(self._reply)",
+        "True",
+        "tests/links/nfc/test_nfc_pieces.py",
+    ),
+    Pattern(
+        "a request that begins again is put together anew",
+        "Responder._collect",
+        "piece.offset <= len(self._held)",
+        "piece.offset == len(self._held)",
+        "tests/links/nfc/test_nfc_pieces.py",
+    ),
+    Pattern(
+        "a value is late once a frame would have been read",
+        "LatestValues.at",
+        "time.monotonic() - arrival.at > self._longest + _UNREAD",
+        "True",
+        "tests/node/test_wrapped_dbc.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"
@@ -2024,5 +2045,19 @@ C_PATTERNS = (
         "own->sha_until = now + ANOTHER_NS;",
         "own->sha_until = own->begun && own->sha_until > now ? own->sha_until : now + ANOTHER_NS;",
         "tests/firmware/test_manage.py",
+    ),
+    CPattern(
+        "each octet of a letter in UTF-8 has limits of its own",
+        "security_teds.c",
+        "            low = 0x80;\n            high = 0xBF;\n        }\n",
+        "        }\n",
+        _IN_ONE_PROCESS,
+    ),
+    CPattern(
+        "no field of a Security TEDS comes twice",
+        "security_teds.c",
+        "type < last || (type == last && type != 108)",
+        "type < last",
+        _IN_ONE_PROCESS,
     ),
 )

@@ -355,6 +355,27 @@ def test_a_meta_teds_of_another_node_gets_9_but_a_2024_uuid_is_not_compared(desk
     assert desk.commit({(0, 1): new_form}).ok
 
 
+@pytest.mark.parametrize(
+    ("name", "good"),
+    [
+        ("\u0080\u07ff\u0800\ud7ff\ue000\U00010000\U0010ffff".encode(), True),
+        (b"\xe0\xa0\x80\xe1\x80\x80\xf0\x90\x80\x80\xf4\x8f\xbf\xbf", True),
+        (b"\xc1\xbf", False),  # overlong
+        (b"\xe0\x9f\xbf", False),
+        (b"\xf0\x8f\xbf\xbf", False),
+        (b"\xed\xa0\x80", False),  # a surrogate
+        (b"\xf4\x90\x80\x80", False),  # beyond U+10FFFF
+        (b"\xe1\x80\xc0", False),
+        (b"ab\xe1\x80", False),
+    ],
+)
+def test_the_name_of_a_ca_is_utf_8(desk: Desk, name: bytes, good: bool) -> None:
+    stood_in = "x" * len(name)
+    shown = security.decode(resigned(desk, ca=stood_in))
+    octets = frame(unframe(shown.encode()).replace(stood_in.encode(), name))
+    assert (desk.commit(BLOCKS, octets) == refusal(Reason.BAD_FORM)) is not good
+
+
 def test_no_extra_field_comes_twice_or_behind_a_later_one(desk: Desk) -> None:
     body = unframe(resigned(desk, extra={112: b"ours", 113: b"ours"}))
     for field in (112, 111):
