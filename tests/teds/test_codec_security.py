@@ -117,6 +117,14 @@ def test_security_of_2024_keeps_unknown_fields() -> None:
     assert teds.recompose(decoded) == octets
 
 
+@pytest.mark.parametrize("unknown", [7, 99])
+def test_a_field_that_the_profile_does_not_know_is_refused_below_111_whatever_stands_above(unknown: int) -> None:
+    assert security.decode(ours(extra={111: b"x", 255: b"more"})).extra == {111: b"x", 255: b"more"}
+    for extra in ({unknown: b"x"}, {unknown: b"x", 255: b"more"}):
+        with pytest.raises(security.NotCanonicalError, match=f"field {unknown} that the profile does not know"):
+            security.decode(ours(extra=extra))
+
+
 @given(st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=4), st.booleans())
 def test_a_layout_that_was_seen_before_changes_no_verdict(changes: list[tuple[int, int]], swapped: bool) -> None:
     good = ours(signed_blocks={(0, 1): bytes(32), (1, 3): b"3" * 32}, extra={120: b"more"})

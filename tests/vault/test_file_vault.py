@@ -138,6 +138,14 @@ def test_a_vault_that_another_process_replaced_is_read_again(tmp_path: Path) -> 
     assert len(person.asked) == 2  # by its maker and by the other: the key of the file is known still
 
 
+def test_the_keys_of_another_station_in_the_same_file_are_not_taken_in(tmp_path: Path, vault: FileVault) -> None:
+    before = vault.secret_material()
+    FileVault.open(tmp_path, STORE, Person())._save(Material.generate())
+    with pytest.raises(VaultError, match="another station"):
+        vault.refresh()
+    assert vault.secret_material() == before
+
+
 def test_a_new_passphrase_replaces_the_old(tmp_path: Path, vault: FileVault) -> None:
     vault.new_passphrase(Person("another good passphrase"), costs=THROWAWAY)()
     with pytest.raises(WrongPassphraseError):
