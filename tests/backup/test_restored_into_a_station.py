@@ -289,6 +289,10 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
     station.audit("test", ONE, "marked")
     merge(station, opened(tmp_path / "old"), dry_run=False)
     assert station.keys.rotation_due(ONE) == "due"
+    station.keys.rotated(ONE)
+    merge(station, opened(tmp_path / "old"), dry_run=False)
+    assert station.keys.rotation_due(ONE) is None, "it was done since"
+    station.keys.demand_rotation(ONE, "due")
     back_up(station, tmp_path / "new")
     stale = tmp_path / "stale"
     with opened(tmp_path / "old") as content:

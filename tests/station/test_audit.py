@@ -129,6 +129,11 @@ def test_a_log_that_was_cut_goes_on_and_the_cut_is_never_forgotten(logged: Store
         again.audit.append("write", NODE, "done")
         verdict = again.audit.check()
         assert (verdict.intact, verdict.first_bad, verdict.count) == (False, 5, 6)
+    outside(home, "DELETE FROM audit WHERE seq > 5")
+    with Store.open(home) as again:
+        again.audit.append("write", NODE, "done")
+        verdict = again.audit.check()
+        assert (verdict.intact, verdict.first_bad, verdict.count) == (False, 5, 6), "the first of two cuts"
 
 
 def test_a_log_of_another_store_does_not_pass(logged: Store, home: Path) -> None:
