@@ -53,6 +53,36 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
     assert station.plant.claims.to_judge(10) == [UUID]
 
 
+def test_each_change_of_a_group_is_reported_once_and_what_changes_nothing_is_not(station: Station) -> None:
+    station.plant.put_record(PlantRecord(REGISTRY))
+    one, two, three = (UUID[:-1] + bytes([number]) for number in range(1, 4))
+
+    def reported() -> list[tuple[int, bool]]:
+        waiting = station.plant.outbox(99)
+        station.plant.drop_events(name for _, name, _ in waiting)
+        events = [json.loads(text) for _, _, text in waiting]
+        assert {(event["act"], event["group"]) for event in events} <= {("grouped", "hand")}
+        return [(bytes.fromhex(event["uuid"])[-1], event["member"]) for event in events]
+
+    for _ in range(2):
+        station.groups.create("hand", [one, two])
+    assert reported() == [(1, True), (2, True)]
+    station.groups.add("hand", [two, three, three])
+    assert reported() == [(3, True)]
+    station.groups.remove("hand", [three, UUID])
+    assert reported() == [(3, False)]
+    assert station.groups.hand_on(one, two) == ["hand"]
+    assert reported() == [(1, False)], "the other one was in it"
+    assert station.groups.hand_on(two, three) == ["hand"]
+    assert reported() == [(2, False), (3, True)]
+    assert station.groups.hand_on(three, None) == ["hand"]
+    assert reported() == [(3, False)]
+    station.groups.add("hand", [one])
+    assert station.groups.delete("hand")
+    assert not station.groups.delete("hand")
+    assert reported() == [(1, True), (1, False)]
+
+
 def test_a_station_that_left_reports_nothing_any_more(station: Station) -> None:
     station.plant.put_record(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
     station.plant.record_event("named", UUID, name="grip")
