@@ -370,3 +370,18 @@ def test_two_nodes_at_one_address_are_the_reason_for_half_a_minute(monkeypatch: 
         now[0] = 100.0 + after
         with pytest.raises(error):
             find(sightings, ONE, seconds=-1.0)
+
+
+def test_a_node_that_answers_where_it_is_has_not_moved() -> None:
+    """Each broadcast would make its supervisor doubt a session that gives values."""
+    sightings, course = Presence(), list[str]()
+    here, there = seen(ONE, 7), seen(ONE, 9, place="can:y")
+    sightings.on_announce(here, lambda: course.append("announced"), lambda: course.append("moved"))
+    for sighting in (here, seen(TWO, 9), here):
+        sightings.add_sighting(sighting)
+    assert course == []
+    sightings.add_sighting(there)
+    assert course == ["moved"]
+    sightings.let_announce(ONE)
+    sightings.add_sighting(there)
+    assert course == ["moved"]

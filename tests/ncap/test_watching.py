@@ -20,7 +20,7 @@ from teds_provision.ncap.membership import Member, Membership
 from teds_provision.ncap.nodes import link_watch
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.ncap.nodes.inspection import look
-from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
+from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch, PresenceCheck
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.running_measurement import RunningMeasurement
 from teds_provision.provisioning.conversation import Conversation
@@ -339,3 +339,25 @@ def test_of_a_reader_that_is_lost_nothing_is_there_any_more(watch: LinkWatch) ->
     assert watch._directory.seen("cd" * 10).present
     watch._notice(Notice("reader-ready", "The reader is back."))
     assert (watch.state.state, watch.state.problem) == ("up", None)
+
+
+def test_of_silent_nodes_five_a_second_are_asked_and_each_once_in_ten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bound of operation.md section 7: a bus of two hundred that fell silent is not flooded with questions."""
+    now, asked = [1000.0], list[tuple[float, int]]()
+
+    def identify(address: int, **_how: Any) -> None:
+        asked.append((now[0], address))
+
+    monkeypatch.setattr(link_watch.time, "monotonic", lambda: now[0])
+    port: Any = SimpleNamespace(identify=identify)
+    check = PresenceCheck(port, lambda uuid: uuid == "held")
+    known: dict[str, Any] = {f"{number}": SimpleNamespace(at=900.0 + number, address=number) for number in range(12)}
+    known["held"] = SimpleNamespace(at=0.0, address=99)
+    known["heard"] = SimpleNamespace(at=999.0, address=98)
+    counts = {}
+    for after in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 10.0):
+        now[0] = 1000.0 + after
+        counts[after] = len(list(check.look(known)))
+    assert counts == {0.0: 5, 0.5: 0, 1.0: 5, 2.0: 2, 3.0: 0, 4.0: 0, 10.0: 5}
+    assert {address for at, address in asked if at == 1000.0} == {0, 1, 2, 3, 4}, "those that are silent longest"
+    assert not {98, 99} & {address for _, address in asked}
