@@ -98,8 +98,11 @@ def test_a_backend_that_forgets_is_found_out_before_a_key_is_trusted_to_it(monke
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", forgetful)
     monkeypatch.setitem(keyring_vault.ALLOWED, forgetful, "forgetful")
     monkeypatch.setattr("keyring.backends.null.Keyring.priority", 1)
+    given: list[str] = []
+    monkeypatch.setattr("keyring.backends.null.Keyring.set_password", lambda _, __, entry, ___: given.append(entry))
     with pytest.raises(VaultError, match="did not store"):
         KeyringVault.create(STORE)
+    assert [entry.partition("/")[0] for entry in given] == ["probe"]
 
 
 def test_without_a_keyring_init_takes_the_passphrase_file_and_says_why(tmp_path: Path) -> None:
@@ -155,6 +158,43 @@ def test_what_is_written_is_made_from_what_is_in_the_keyring_now(monkeypatch: py
     with pytest.raises(VaultError, match="no longer has"):
         other.add_master()
     assert backend.entries == {}
+
+
+class BrokenKeyring(MemoryKeyring):
+    """A keyring that answers nothing, for a reason of its own."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self.error = error
+
+    def get_password(self, service: str, entry: str) -> str | None:
+        raise self.error
+
+
+def test_of_several_keyrings_the_one_with_the_entry_opens_and_else_the_first_that_failed_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    name = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}"
+    monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
+    first, second = BrokenKeyring(OSError()), BrokenKeyring(ValueError())
+    empty, full = MemoryKeyring(), MemoryKeyring()
+
+    def on(*backends: MemoryKeyring) -> None:
+        monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, backend) for backend in backends]))
+
+    on(full)
+    made = KeyringVault.create(STORE)
+    assert list(full.entries) == [(keyring_vault.SERVICE, f"station/{STORE}")], "no probe is left"
+    on(first, empty, full)
+    assert KeyringVault.open(STORE).identity().point == made.identity().point
+    for backends, words in (
+        ((first, empty, second), "OSError"),
+        ((empty, second, first), "ValueError"),
+        ((empty,), "no entry"),
+    ):
+        on(*backends)
+        with pytest.raises(VaultError, match=words):
+            KeyringVault.open(STORE)
 
 
 # From here on a real Secret Service.
