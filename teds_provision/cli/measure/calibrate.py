@@ -73,7 +73,7 @@ def zero(
     dry_run: bool,
     links: LinkSettings,
 ) -> None:
-    """Make a channel read 0, or --value V, where it stands now.
+    """Make a channel read 0, or --value V, in its present position.
 
     Reads the channel, then signs, writes and verifies the datasheet with the new zero offset. The curve and the date of
     the calibration stay; the zero offset gets a date of its own. Nothing is written if the reading is unstable or the

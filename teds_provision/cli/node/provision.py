@@ -108,7 +108,7 @@ def provision(
     links: LinkSettings,
     line: LineChoice | None = None,
 ) -> None:
-    """Identify, whitelist, agree, build, sign, write and verify; continues where an earlier run stopped.
+    """Identify, whitelist, agree, build, sign, write and verify; continues an earlier run that was stopped.
 
     --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
     --calibration, --name) changes, or what you confirm after seeing the changes.

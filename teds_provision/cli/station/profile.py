@@ -192,7 +192,7 @@ profile.add_command(check)
 )
 @click.option("--message", metavar="NAME", help="Message of the DBC file (default: the only one).")
 @click.option(
-    "--map", "mapping", type=FileToRead(), metavar="FILE", help="Where each key stands in that XML, and its unit."
+    "--map", "mapping", type=FileToRead(), metavar="FILE", help="Place of each key in that XML, and its unit."
 )
 @click.option(
     "--output",

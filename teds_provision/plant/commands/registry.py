@@ -294,7 +294,7 @@ def _what(every: bool, group: str | None, profile: str | None) -> Any:
 @_change_options
 @pass_app
 def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
-    """Remove a station for good. What it published up to its last page still counts."""
+    """Remove a station permanently. What it published up to its last page still counts."""
     reasons: tuple[roster.Why, ...] = ("retired", "lost", "stolen")
     given = [reason for reason in reasons if how[reason]]
     if len(given) != 1:
