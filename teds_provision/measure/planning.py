@@ -186,9 +186,10 @@ def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: StreamK
     fitting = {channel.number: channel for channel in channels if channel.sample and channel.kind in _SENSORS_OF[kind]}
     for number in wanted:
         if number not in fitting:
+            known = ", ".join(f"{channel.number} ({channel.name})" for channel in fitting.values())
             raise BadDataError(
                 f"Channel {number} is not a sensor that can be measured this way.",
-                hint=f"It has {', '.join(map(str, fitting)) or 'none'}.",
+                hint=f"Those that can: {known}." if known else "The node has none.",
             )
     if not fitting:
         raise BadDataError("The datasheet has no sensor that can be measured this way.")

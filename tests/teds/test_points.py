@@ -101,6 +101,11 @@ def test_the_caller_names_the_channel_of_a_file_that_names_none(tmp_path: Path, 
     named.write_text("# channel: 2\n" + text if name.endswith(".csv") else "channel = 2\n" + text)
     with pytest.raises(BadDataError, match="holds no calibration of channel 3"):
         load_calibrations(named, gripper, CertificateChoice(channel=3))
+    for_all = tmp_path / f"all-{name}"
+    for_all.write_text("# channel: all\n" + text if name.endswith(".csv") else 'channel = "all"\n' + text)
+    assert load_calibrations(for_all, gripper, CertificateChoice(channel=2)).keys() == {2}, "3 is in N, and not meant"
+    with pytest.raises(BadDataError, match="not of the same kind"):
+        load_calibrations(for_all, gripper)
 
 
 def test_residuals_of_a_known_line() -> None:

@@ -360,8 +360,9 @@ def _certified_channel(file: str, profile: Profile, number: int | None) -> Chann
 def read_calibrations(text: str, file: str, profile: Profile, channel: int | None = None) -> dict[int, Calibration]:
     """Read calibrations as :func:`load_calibrations` does, from text.
 
-    The ending of the name ``file`` decides: .toml, .json, .xml for a certificate, else CSV. ``channel`` is what a
-    calibration is for that names no channel itself; None: the only one of the profile that can be meant.
+    The ending of the name ``file`` decides: .toml, .json, .xml for a certificate, else CSV. ``channel``: read those
+    of this channel alone, and take one that names no channel as its own; None: all, and such a one is for the only
+    channel of the profile that can be meant.
     """
     if Path(file).suffix.lower() == CERTIFICATE:
         return read_certified(text.encode(), file, profile)
@@ -377,6 +378,8 @@ def read_calibrations(text: str, file: str, profile: Profile, channel: int | Non
         if channel is not None:
             order.values.setdefault("channel", (channel, order.line))
         for meant in _channels(order, profile):
+            if channel is not None and meant.number != channel:
+                continue
             if meant.number in out:
                 raise order.wrong("channel", f"channel {meant.number} has two calibrations in this file.")
             out[meant.number] = calibration_of(order, meant)
