@@ -334,7 +334,8 @@ def purpose_of(arguments: list[str]) -> Purpose:
     """
     name = _command_name(arguments)
     writes = any(word.startswith(("--output", "-o")) for word in arguments)
-    only_shows = not name or (name in _SHOWING and not writes)
+    shows = name in _SHOWING or (name == "export" and "-" in arguments)
+    only_shows = not name or (shows and not writes)
     return Purpose(only_shows, must_print=only_shows or _wants(arguments, "--json"))
 
 

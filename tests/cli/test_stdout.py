@@ -69,6 +69,7 @@ def test_json_that_a_full_disk_does_not_take_is_7_after_the_work(home: Path, run
         ("--quiet whitelist list", 7),
         ("whitelist --quiet list", 7),
         ("log", 7),
+        ("whitelist export -", 7),
         ("--help", 7),
         ("", 7),
         (f"whitelist remove {UUID.hex()} --yes", 0),

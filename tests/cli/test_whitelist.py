@@ -129,3 +129,16 @@ def test_changing_a_pin_needs_the_vault_and_a_list_does_not(home: Path) -> None:
     assert call(home, "whitelist", "remove", ONE, "--yes", passphrase=None).code == 7
     listed = call(home, "--json", "whitelist", "list", passphrase=None).json["whitelist"]
     assert [entry["uuid"] for entry in listed] == [ONE]
+
+
+@pytest.mark.parametrize("form", ["csv", "json", "xml"])
+def test_a_dash_is_stdout_and_no_file_of_that_name(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call(home, "whitelist", "add", "8d4d9da65281f7000000", "--fingerprint", "ab" * 32).code == 0
+    printed = call(home, "whitelist", "export", "-", "--format", form)
+    assert call(home, "whitelist", "export", tmp_path / "list", "--format", form).code == 0
+    assert printed.out == (tmp_path / "list").read_text()
+    assert not (tmp_path / "-").exists()
+    assert call(home, "--json", "whitelist", "export", "-").code == 2

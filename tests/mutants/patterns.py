@@ -1292,7 +1292,7 @@ PATTERNS = (
     Pattern(
         "a list that was cut short is a failure",
         "purpose_of",
-        "name in _SHOWING and not writes",
+        "shows and not writes",
         "False",
         "tests/cli/test_stdout.py",
     ),

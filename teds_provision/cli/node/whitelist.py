@@ -15,7 +15,7 @@ from teds_provision.cli.named_files import write_file
 from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import local_time, print_json_list, shown
-from teds_provision.errors import NotFoundError
+from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.sanitize import counted
 from teds_provision.station.label import read_label
@@ -172,19 +172,26 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     "export",
     context_settings=COMMAND_SETTINGS,
     short_help="Write every entry to a file.",
-    epilog=examples("teds-provision whitelist export whitelist.csv"),
+    epilog=examples("teds-provision whitelist export whitelist.csv", "teds-provision whitelist export - --format csv"),
 )
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 @click.option(
     "--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: from the extension, otherwise xml."
 )
 @dry_run_option
 @pass_app
 def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
-    """Write all entries, sorted, to a file; an existing file is replaced in one step."""
+    """Write all entries, sorted, to a file (- for stdout); an existing file is replaced in one step."""
     station = app.station()
+    to_stdout = str(file) == "-"
+    if to_stdout and app.json:
+        raise UsageError("--json prints the whitelist itself.", hint="Omit --json, or name a file.")
     form = provisioning.whitelist.form_of(file, form)
     entries = list(provisioning.whitelist.named(station, station.pins.all_entries()))
+    if to_stdout and not dry_run:
+        for text in provisioning.whitelist.render(entries, form):
+            click.echo(text, nl=False)
+        return
     if not dry_run:
         write_file(file, provisioning.whitelist.render(entries, form))
     listed = [provisioning.whitelist.as_dict(entry) for entry in entries] if app.json else []
