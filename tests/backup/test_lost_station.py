@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from teds_provision.backup.restore import open_present
 from teds_provision.errors import NotFoundError, StoreError
-from teds_provision.station.snapshot import place
+from teds_provision.station.snapshot import place, set_aside
 from teds_provision.station.station import Station
 from teds_provision.station.store.store import Store
 from teds_provision.vault.selection import forget_vaults
@@ -66,6 +67,55 @@ def test_a_damaged_store_is_kept_under_another_name(station: Station, tmp_path: 
     again = Station.open(home, ask=ask)
     assert keys_of(again, ONE)[0][0] == 1
     again.close()
+
+
+@pytest.mark.parametrize("left", [None, "2026-11-01T00:00:00Z"], ids=["member", "left"])
+def test_a_rebuilt_home_of_a_plant_has_another_name_and_looks_for_its_pages_first(
+    station: Station, tmp_path: Path, left: str | None
+) -> None:
+    """Also after it left: it may take part again, and its pages since the backup are in the registry."""
+    registry, home = "0b7a6c3e-5a0c-4f59-9d0b-3a1c2e4f5a6b", station.home
+    station.plant.join(registry, None)
+    joined = station.plant.record()
+    assert joined is not None
+    station.plant.put_record(replace(joined, left=left))
+    name = station.plant.home
+    back_up(station, tmp_path / "station.backup")
+    station.close()
+    (home / "store.sqlite3").unlink()
+    restored_into(home, opened(tmp_path / "station.backup"))
+    again = Station.open(home, ask=ask)
+    assert again.plant.home != name, "another copy of this home may write under the old name"
+    again.plant.join(registry, None)
+    assert again.plant.restored
+    again.close()
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_a_damaged_store_keeps_its_name_until_its_log_is_set_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """A store that was renamed before its log is no store any more: the repeated command would leave the log there."""
+    ends = ("", "-wal", "-shm")
+    for end in ends:
+        (tmp_path / f"store.sqlite3{end}").write_bytes(b"damaged" + end.encode())
+    renames, rename = [0], Path.rename
+
+    def dying(path: Path, target: Path) -> Path:
+        renames[0] += 1
+        if renames[0] == step:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", dying)
+        with pytest.raises(KeyboardInterrupt):
+            set_aside(tmp_path)
+    assert (tmp_path / "store.sqlite3").exists()
+    assert set_aside(tmp_path).read_bytes() == b"damaged"
+    kept = {path.read_bytes() for path in tmp_path.glob("store.sqlite3.damaged-*")}
+    assert kept == {b"damaged" + end.encode() for end in ends}
+    assert not any((tmp_path / f"store.sqlite3{end}").exists() for end in ends)
 
 
 def test_a_store_is_never_put_over_another(station: Station, tmp_path: Path) -> None:

@@ -10,13 +10,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import pytest
 
 from teds_provision import files
 from teds_provision.cli.main import run as in_process
+from teds_provision.errors import WrongPassphraseError
 from teds_provision.vault import agent, selection
+from teds_provision.vault.base import Ask
+from teds_provision.vault.pkcs11 import Pkcs11Vault
 from teds_provision.vault.pkcs11_token import ask_pin
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 from teds_provision.vault.selection import forget_vaults
@@ -112,6 +115,39 @@ def test_a_pin_that_is_held_is_not_spent_on_the_last_attempt() -> None:
     ShownToken.flags = TokenFlag.USER_PIN_FINAL_TRY
     assert ask_pin(cast(Any, ShownToken), uri, give) == "typed"
     assert len(asked) == 1
+
+
+def test_a_pin_that_turns_out_wrong_does_not_stay_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The token counts each try: the next command must ask a person and not spend the same PIN again."""
+    tried: list[str] = []
+
+    def refuse(home: Path, store_id: str, uri: str, ask: Ask) -> NoReturn:
+        tried.append(ask("PIN", False))
+        raise WrongPassphraseError("The PIN is wrong.")
+
+    monkeypatch.setattr(Pkcs11Vault, "open", refuse)
+    listener = files.listen_alone(tmp_path / agent.SOCKET, 16)
+    page = page_with(b"Pheld")
+
+    def hold() -> None:
+        with listener:  # who asks after the end must not wait for an answer
+            agent.serve(listener, page, agent._now() + 60)
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    try:
+        for expected in ("held", "typed"):
+            with pytest.raises(WrongPassphraseError):
+                selection.open_vault(
+                    tmp_path, "5e" * 16, "pkcs11:token=t", lambda prompt, confirm: "typed", use_agent=True
+                )
+            assert tried == [expected], "one try for each command"
+            tried.clear()
+            assert agent.held(tmp_path, "pkcs11") is None
+    finally:
+        agent.lock(tmp_path)
+        thread.join(60)
+    assert bytes(page.view()) == b""
 
 
 def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

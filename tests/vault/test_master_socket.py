@@ -35,3 +35,4 @@ def test_another_user_at_either_end_neither_gets_nor_gives_keys(
         assert came == []
         assert handed_over() is True
     assert came == [dict(masters.keys)]
+    assert not (tmp_path / master_socket.SOCKET).exists(), "a command would find a socket where no process listens"

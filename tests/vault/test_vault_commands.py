@@ -297,6 +297,9 @@ def test_master_keys_come_only_from_a_process_that_knows_one_of_this_store(home:
     assert not station.accept_masters(foreign), "the vault was not opened" if station._vault is None else "another key"
     assert not station.accept_masters(foreign.with_new().newest_only())
     assert station.accept_masters(station.vault.master_keys().with_new())
+    here = station.vault.master_keys().keys
+    assert not station.accept_masters(MasterKeys({**here, 2: bytes(32)})), "the first key is the same, not the second"
+    assert station.vault.master_keys().keys == here
     assert keys(station) == before
     rewrap(other := opened(home))
     assert hand_over(home, other.vault.master_keys()) is None, "no process listens"
