@@ -97,7 +97,22 @@ def test_sample_that_does_not_fit_its_model() -> None:
     assert only(teds.compose(3, {**CHANNEL, "Sample": sample}), "sample").field == "SigBits"
 
 
-@pytest.mark.parametrize(("modes", "default", "good"), [(0x1F, 16, True), (1, 5, True), (1, 16, False), (1, 0, False)])
+@pytest.mark.parametrize(
+    ("modes", "default", "good"),
+    [
+        (0x1F, 16, True),
+        (0x08, 8, True),
+        (1, 5, True),
+        (0x10, 1, True),
+        (1, 16, False),
+        (0x10, 8, False),
+        (1, 0, False),
+        (0x1F, 0, False),
+        (0x1F, 6, False),  # two bits
+        (0x1F, 24, False),
+        (0x3F, 32, False),  # a bit of the mask that is no mode
+    ],
+)
 def test_default_mode_is_a_bit_of_the_mask_or_a_number(modes: int, default: int, good: bool) -> None:
     octets = teds.compose(3, {**CHANNEL, "Sampling": {"SampMode": modes, "SDefault": default}})
     assert ("sampling" not in codes(octets)) == good

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit, read_calibrations
 from teds_provision.teds.codec.frame import frame, unframe
+from teds_provision.teds.curve import channel_of
 from teds_provision.teds.guard import GuardFinding, check_calibration
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
@@ -266,6 +268,17 @@ def test_the_significant_bits_set_the_raw_range() -> None:
     assert check_calibration(built(profile, line, 2), None, profile) == []
 
 
+@pytest.mark.parametrize("raw_range", [(-65535, 131070), (131070, 140000)], ids=["wider", "beside"])
+def test_a_raw_range_of_the_teds_is_no_wider_than_its_data_model(
+    raw_range: tuple[float, float], tactile: Profile
+) -> None:
+    """What the converter cannot give is not held against the limits: the curve would be beyond them there."""
+    blocks = built(tactile, force_line(raw_range=raw_range))
+    assert check_calibration(blocks) == []
+    too_steep = built(tactile, force_line(0.0, 12 / 65535, raw_range=raw_range))
+    assert text(check_calibration(too_steep), "limits").startswith("raw 65535 gives 12 N")
+
+
 def test_an_adjusted_zero_of_a_full_turn_is_not_beyond_its_limits(magnetic: Profile) -> None:
     blocks = built(magnetic, replace(angle_table(), zero_offset=45.0))
     assert check_calibration(blocks, None, magnetic) == []
@@ -308,6 +321,27 @@ def test_a_jump_in_a_table_is_refused(magnetic: Profile) -> None:
     coefficients[2 * 50] += 2.5
     findings = check_calibration(built(magnetic, replace(table, coefficients=tuple(coefficients))))
     assert "jump" in codes(findings)
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.98, False), (1.02, True)])
+def test_a_jump_is_refused_from_the_stated_uncertainty_on(share: float, found: bool, magnetic: Profile) -> None:
+    table = angle_table(101)
+    tolerance = channel_of(1, built(magnetic, table), magnetic).tolerance
+    coefficients = list(table.coefficients)
+    coefficients[0] += share * math.degrees(tolerance)  # of the first segment: it jumps at its end alone
+    blocks = built(magnetic, replace(table, coefficients=tuple(coefficients)))
+    assert ("jump" in codes(check_calibration(blocks))) == found
+
+
+@pytest.mark.parametrize(("step", "found"), [(0.4, False), (0.6, True)])
+def test_a_jump_of_an_actuator_counts_from_half_a_raw_value_on(step: float, found: bool) -> None:
+    """What rounds to the same set point is no jump."""
+    profile = load_profile("gripper", [shipped_profiles()])
+    points = [(0.0, 0.0), (2000.0, 55.0), (4000.0, 110.0)]
+    good = replace(fit(points, "table", channel=1, actuator=True), unit=parse_unit("mm"))
+    start, *others = good.coefficients
+    blocks = built(profile, replace(good, coefficients=(start + step, *others)))
+    assert ("jump" in codes(check_calibration(blocks, None, profile))) == found
 
 
 def test_a_large_change_and_a_lost_calibration_are_reported(tactile: Profile) -> None:

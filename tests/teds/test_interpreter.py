@@ -389,6 +389,43 @@ def test_an_actuator_is_set_within_its_limits_and_read_back() -> None:
         interpreter.encode(math.nan)
 
 
+def bent_actuator(falling: bool, **more: object) -> tuple[ChannelInterpreter, PreparedCurve]:
+    """An actuator with a curve that is not straight, calibrated over the middle half of its limits alone."""
+    number = next(channel.number for channel in sheet_of("gripper").channels if channel.actuator)
+    own = sheet_of("gripper").channel(number)
+    assert own is not None
+    low, high = own.unit.from_si(own.low), own.unit.from_si(own.high)
+    span, way = high - low, -1 if falling else 1
+    coefficients = (4010.0 if falling else 10.0, way * 2000 / span, way * 2000 / span**2)
+    part = CalibrationInput(number, 2, (low + span / 4, high - span / 4), (low,))
+    calibration = Calibration(number, "polynomial", (part,), coefficients, unit=own.unit, actuator=True)
+    sheet = changed(actuator(calibration), number, **more)
+    return ChannelInterpreter(sheet, number), PreparedCurve(calibration)
+
+
+@pytest.mark.parametrize("falling", [False, True])
+def test_the_raw_set_point_of_an_actuator_is_searched_up_to_both_limits(falling: bool) -> None:
+    interpreter, curve = bent_actuator(falling)
+    low, high = interpreter.limits
+    raws = np.array([10, 1000, 4010], dtype=np.uint64)
+    back = interpreter.values(raws if not falling else raws[::-1]).value
+    assert back[[0, 2]].tolist() == pytest.approx([low, high], abs=1e-6 * (high - low))
+    assert curve(back[1:2]).tolist() == pytest.approx([1000]), "as close as the curve gives it, whatever the unit"
+    beyond = interpreter.values(np.array([0, 4095], dtype=np.uint64)).value
+    assert beyond.tolist() == pytest.approx([high, low] if falling else [low, high])
+
+
+@pytest.mark.parametrize("open_end", ["low", "high"])
+def test_an_actuator_without_one_of_its_limits_is_read_back_within_its_calibration(open_end: str) -> None:
+    interpreter, curve = bent_actuator(False, **{open_end: math.nan})
+    assert interpreter.channel.calibration is not None
+    low, high = interpreter.channel.calibration.inputs[0].boundaries
+    middle = (low + high) / 2
+    back = interpreter.values(np.rint(curve(np.array([low, middle, high]))).astype(np.uint64))
+    assert back.valid.all()
+    assert back.value.tolist() == pytest.approx([low, middle, high], rel=1e-3)
+
+
 def test_an_actuator_whose_curve_turns_can_be_set_but_not_read_back() -> None:
     number = next(channel.number for channel in sheet_of("gripper").channels if channel.actuator)
     own = sheet_of("gripper").channel(number)

@@ -85,6 +85,16 @@ def test_a_calibration_gives_unit_uncertainty_and_due_date() -> None:
     assert channel.uncertainty != channel.stated_uncertainty
 
 
+def test_a_display_unit_of_another_kind_leaves_the_unit_of_the_datasheet() -> None:
+    """A profile of that name may have changed: its unit says nothing of this board, whose calibration does."""
+    sheet = Sheet.from_image(image_of("magnetic-angular-position-sensor", {1: line(unit="mrad")}))
+    (channel,) = sheet.channels[:1]
+    assert channel.shown.text == "mrad"
+    assert replace(channel, display="turn").shown.text == "turn"
+    for display in ("N", "K", "no such unit"):
+        assert replace(channel, display=display).shown == channel.unit, display
+
+
 def test_a_calibration_that_cannot_be_computed_is_reported_and_left_out() -> None:
     broken = {
         "not finite": line(zero_offset=math.inf),
