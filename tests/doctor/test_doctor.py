@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 import teds_provision.links
+from teds_provision import teds
 from teds_provision.doctor import checks
 from teds_provision.doctor import machine as doctor_machine
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code
@@ -468,6 +469,24 @@ def test_keys_that_no_command_knows_are_named(stationed: System) -> None:
     )
 
 
+def test_profiles_of_this_home_alone_are_checked(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in the working folder is of somebody else, and is refused where it is used."""
+    assert look(system, "profiles")[0].result == "skipped"
+    own, others = system.home / "profiles", system.workspace / "profiles"
+    monkeypatch.setattr(teds.profile, "default_folders", lambda home: (own, others))
+    for folder in (own, others):
+        folder.mkdir(parents=True)
+    (own / "mine.toml").write_text("title = 'x'\nchannel = {}\n")
+    (others / "theirs.toml").write_text("no TOML")
+    (found,) = look(system, "profiles")
+    assert "theirs" not in found.why
+    (own / "broken.toml").write_text("no TOML")
+    broken = look(system, "profiles")
+    assert {finding.result for finding in broken} == {"failed"}
+    assert "Cannot use profile broken" in broken[0].why
+    assert not any("theirs" in finding.why for finding in broken)
+
+
 def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: System) -> None:
     (stationed.home / "store.sqlite3").unlink()
     found = by_name(stationed)["store file"]
@@ -483,11 +502,13 @@ def test_what_waits_for_a_person_is_reported(stationed: System) -> None:
         store.keys.add(KeyRecord(bytes(10), 1, "ab" * 8, "active", 1, b"wrapped"))
         later = [deferred(datetime(2099, 1, day, tzinfo=UTC), "station lost was removed") for day in (2, 1, 3)]
         store.keys.put_flags({b"\1" * 10: KeyFlags(rotation="restored")})
+        over = deferred(datetime(2020, 1, 1, tzinfo=UTC), "station lost was removed")  # its holder did not come
+        store.keys.put_flags({b"\7" * 10: KeyFlags(rotation=over)})
         store.keys.put_flags({bytes([2 + n]) * 10: KeyFlags(rotation=why) for n, why in enumerate(later)})
     found = look(stationed, "nodes")
     reasons = [finding.why for finding in found]
     counts = [why.split()[0] for why in reasons]
-    assert counts == ["3", "2", "1", "1", "1", "3"]
+    assert counts == ["3", "2", "1", "1", "2", "3"]
     words = ("expired", "name", "not written", "never verified", "must be rotated", "another holder rotates first")
     for why, word in zip(reasons, words, strict=True):
         assert word in why
