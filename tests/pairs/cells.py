@@ -94,7 +94,14 @@ def _meet(scene: Scene, cell: Cell, long_run: LongRun) -> list[str]:
         ended = _end(scene, _start(scene, change))
         _follow(scene, change, long_run, ended)
         long_run.end()
-    return [*_change_holds(scene, cell, long_run, ended), *long_run.complaints, *_store_holds(scene, cell, ended)]
+    complaints = [] if _locked_out(cell, long_run) else long_run.complaints
+    return [*_change_holds(scene, cell, long_run, ended), *complaints, *_store_holds(scene, cell, ended)]
+
+
+def _locked_out(cell: Cell, long_run: LongRun) -> bool:
+    """Return True if the long run began with a passphrase that the change replaced before it was used: exit 7."""
+    ended = long_run.ended
+    return cell.when == BEFORE and cell.change.locks_out and ended is not None and not ended.is_bug and ended.code == 7
 
 
 def _start(scene: Scene, change: Change) -> Child | None:

@@ -27,6 +27,7 @@ class Change:
     ``refused``: the exit code if a measurement holds what it changes (None: it is never refused).
     ``verdicts``: the exit code of ``verify`` for a node afterwards, 0 for those not named. ``again``: how it may end
     when it is repeated. ``ends``: the exit codes of a long run that the change ends, by the name of the run.
+    ``locks_out``: a long run that begins beside it may find its passphrase replaced, and do nothing (7).
     ``after`` takes note of what the change did; ``edit`` changes a file, in place of a command.
     """
 
@@ -40,6 +41,7 @@ class Change:
     verdicts: Mapping[str, int] = field(default_factory=dict)
     again: tuple[int, ...] = (0,)
     ends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    locks_out: bool = False
     after: Callable[[Scene, Outcome], None] | None = None
     edit: Callable[[Scene], None] | None = None
 
@@ -209,7 +211,7 @@ CHANGES: Final = (
            lambda scene: "crane/slew" in str(scene.ask("names", "list")), refused=6, touches=("target",)),
     Change("config set", ("config", "set", "rate", "5"), EVERY, _set("rate", 5.0)),
     Change("vault passphrase", ("vault", "passphrase", "--new-passphrase-fd", "{NEW_FD}"), EVERY,
-           _opens, after=_keeps_new_passphrase, ends={"signer run": (0, 7, 130)}),
+           _opens, after=_keeps_new_passphrase, ends={"signer run": (0, 7, 130)}, locks_out=True),
     Change("vault rewrap", ("vault", "rewrap", "--yes"), EVERY, lambda scene: True,
            ends={"provision --watch": (0, 7, 130), "signer run": (0, 7, 130), "registry sync": (0, 7)}),
     Change("agree --rotate", ("agree", "{TARGET}", "--rotate", "BUS"),
