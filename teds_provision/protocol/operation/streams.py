@@ -81,8 +81,8 @@ class Stream:
                 octets = pattern(self.channels[0], self.layout.octets, self._patterned)
                 self._patterned += 1
                 self._event(due, octets, valid=True)
-            elif self._held == 0 and now - due >= 3 * self.span:
-                # after a suspend of the host, the missed messages count as lost
+            elif self._held == 0 and now - due >= 3 * self.span and self.counter < LAST_COUNTER:
+                # after a suspend of the host, the missed messages count as lost; the last one is sent
                 self._skip((now - due) // self.span - 1)
             else:
                 self._instant(hardware, due)

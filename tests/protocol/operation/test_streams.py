@@ -45,7 +45,7 @@ def test_a_node_that_slept_long_loses_whole_messages_and_shows_it() -> None:
     bench.hardware.tick = 700 * MS
     bench.until(760 * MS)
     found = consumer.messages()
-    assert consumer.receiver.counts.lost > 10
+    assert consumer.receiver.counts.lost == bench.tim.missed > 10
     assert all(values(m) == [m.tick // MS, m.tick // MS + 10] for m in found), "what comes is right"
     assert found[0].tick >= 660 * MS
 
@@ -162,6 +162,21 @@ def test_the_last_counter_is_sent_and_ends_the_stream() -> None:
     assert message.counter == LAST_COUNTER
     assert not bench.tim._role.streams.running  # type: ignore[union-attr]
     assert bench.reason(stop(0)) == Reason.WRONG_STATE
+
+
+def test_a_node_that_slept_past_the_last_counter_sends_it_and_ends_the_stream() -> None:
+    """No counter beyond the last is counted as lost: none was due."""
+    bench = Bench().open().operate(1)
+    consumer = Consumer(bench, n=1, period=10 * MS, start=100 * MS)
+    (stream,) = bench.tim._role.streams._streams  # type: ignore[union-attr]
+    stream.counter = LAST_COUNTER - 20
+    stream.start = consumer.receiver.start = 100 * MS - stream.counter * 10 * MS
+    bench.hardware.tick = 5 * SECOND
+    bench.until(5 * SECOND + 10 * MS)
+    (message,) = consumer.messages()
+    assert (message.counter, values(message)) == (LAST_COUNTER, [300])
+    assert bench.tim.missed == 20
+    assert not bench.tim._role.streams.running  # type: ignore[union-attr]
 
 
 def test_ble_streams_are_whole_notifications_of_their_connection() -> None:
