@@ -200,6 +200,7 @@ CHANNEL_TEDS = {
     "a kind of 4 octets": frame(_CHANNEL + bytes.fromhex("0b0400000000") + _BODY[3:]),
     "a kind of 256": frame(_CHANNEL + bytes.fromhex("0b020100") + _BODY[3:]),
     "a halt of 2 octets": frame(_CHANNEL + _BODY + bytes.fromhex("24020000")),
+    "a halt, of a sensor": frame(_CHANNEL + _BODY + bytes.fromhex("240101")),
     "a model of 2 octets": frame(_CHANNEL + bytes.fromhex("0b0100" + "120a" + "28020000" + "290102" + "2a0108")),
     "a width of 2 octets": frame(_CHANNEL + bytes.fromhex("0b0100" + "120a" + "280100" + "29020002" + "2a0108")),
     "a part that runs past its end": frame(_CHANNEL + bytes.fromhex("0b0100" + "1209280100" + "290102" + "2a0908")),

@@ -127,6 +127,13 @@ def test_an_actuators_halt_need_not_be_there() -> None:
     assert bench.reason(operate(4, dead_man=500)) is None
 
 
+@pytest.mark.parametrize("halt", [0, 1, 2, 255])
+def test_a_halt_in_the_teds_of_a_sensor_does_not_matter(halt: int) -> None:
+    """Nothing of a sensor halts, whatever a foreign datasheet states."""
+    bench = Bench(teds={(2, 3): channel_teds(channels()[2], halt=halt)}).open()
+    assert bench.reason(operate(2)) is None
+
+
 def test_data_sets_in_the_order_of_section_2() -> None:
     bench = Bench().open().operate(1, 4, 5)
     bench.hardware.faults = {4, 5}
