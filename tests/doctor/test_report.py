@@ -56,6 +56,7 @@ def test_one_uuid_is_one_word_and_fingerprints_are_gone(tmp_path: Path) -> None:
     mask = Mask(System(tmp_path), with_uuids=False)
     other = "1111111111111f000000"
     assert mask(f"{UUID} and {other}, {UUID}") == "UUID-1 and UUID-2, UUID-1"
+    assert mask(f"{UUID.upper()} too") == "UUID-1 too", "however it is written"
     assert mask("key " + "ab" * 32) == "key HEX"
     assert mask("5fa9 1809 991e e906 7a8b 1a1c 6ad8 114b") == "HEX"
     assert mask(f"{tmp_path}/x of {getpass.getuser()}") == "HOME/x of USER"

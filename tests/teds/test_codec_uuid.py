@@ -40,6 +40,14 @@ def test_worked_example() -> None:
     assert teds.UuidParts.at(47 + 1 / 60, 14 + 17.5 / 60, manufacturer=0, year=2026, seconds=10000) == parts
 
 
+@pytest.mark.parametrize(("seconds", "units"), [(0, 0), (6, 0), (9.9, 0), (10, 1), (365 * 86400 - 0.1, 3153599)])
+def test_a_moment_counts_whole_units_of_ten_seconds(seconds: float, units: int) -> None:
+    """Rounded up, the last seconds of a year would be a moment of no year."""
+    parts = teds.UuidParts.at(0, 0, manufacturer=0, year=2026, seconds=seconds)
+    assert parts.time == units
+    assert parts.moment is not None
+
+
 def test_2024_form() -> None:
     parts = parts_of("86258A0B72F612D68707E8054911DCF0")
     assert (parts.edition, parts.north, parts.latitude, parts.east, parts.longitude) == (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -113,3 +114,9 @@ def test_the_secret_line_fits_every_keyring_and_goes_both_ways() -> None:
 def test_no_secret_line_raises_anything_foreign(line: str) -> None:
     with pytest.raises(VaultError):
         Material.decode(line)
+
+
+def test_keys_without_a_master_key_are_damaged() -> None:
+    """Nothing could be opened with them, and the next rewrap would begin from none."""
+    with pytest.raises(VaultError, match="damaged"):
+        Material.decode(replace(Material.generate(), masters=MasterKeys({})).encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import select
+import socket
 import time
 from collections.abc import Callable
 
@@ -172,3 +173,12 @@ def test_an_error_frame_that_says_bus_off_is_a_link_failure(group: str) -> None:
         with pytest.raises(LinkError, match="bus-off"):
             bus.receive(PATIENCE)
     bus.close()
+
+
+@pytest.mark.parametrize("seconds", [-30.0, 30.0])
+def test_a_stamp_after_the_wall_clock_was_set_counts_as_none(seconds: float) -> None:
+    """Set back, it would put the arrival into the future, and a bound of the node's clock would be wrong."""
+    stamp = time.time_ns() - int(seconds * 1e9)
+    ancillary = [(socket.SOL_SOCKET, multicast._TIMESTAMPNS, multicast._STAMP.pack(*divmod(stamp, 10**9)))]
+    before = time.monotonic()
+    assert before <= multicast.arrival(ancillary) <= time.monotonic()

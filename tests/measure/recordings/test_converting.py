@@ -260,3 +260,13 @@ def test_of_very_many_notes_the_first_are_shown() -> None:
     for number in range(2 * NOTES):
         summary.add_entry(Note(float(number), "The disk was full."))
     assert [note.at for note in summary.notes] == [float(number) for number in range(NOTES)]
+
+
+def test_a_report_after_rows_of_a_node_belongs_to_this_file() -> None:
+    """Counts before the first values are of an earlier part; rows of a grid are values, too."""
+    summary = RecordingSummary()
+    rows = GroupRows("hand", ((ARM, 1),), np.arange(5.0), np.ones((5, 1)), np.zeros((5, 1)))
+    summary.add_entry(rows)
+    for samples, lost in ((5, 2), (10, 3)):
+        summary.add_entry(NodeReport(ARM, "running", "", samples, lost, 0, 0, 0))
+    assert summary._of_this_file(summary.reports[ARM]) == summary.reports[ARM]
