@@ -88,6 +88,15 @@ def test_a_recovery_key_opens_it_and_no_other(station: Station, tmp_path: Path) 
         SealedFile(path).open_with_key(recovery)
 
 
+def test_a_backup_to_a_key_of_the_station_itself_is_warned_of(station: Station, tmp_path: Path) -> None:
+    """Neither its own key nor its CA key is there when the station is lost."""
+    for number, point in enumerate((station.point, station.ca)):
+        assert any(
+            "if the station is lost" in text for text in back_up(station, tmp_path / f"{number}", point).warnings
+        )
+    assert back_up(station, tmp_path / "2", SoftwareKey.generate().point).warnings == ()
+
+
 def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Station, tmp_path: Path) -> None:
     """Whoever has the public recovery key can seal something; it must not pass for this station."""
     recovery, path, forger = SoftwareKey.generate(), tmp_path / "station.backup", SoftwareKey.generate()

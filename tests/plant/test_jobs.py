@@ -28,7 +28,7 @@ from teds_provision.plant import jobs, parcels
 from teds_provision.plant import line as line_module
 from teds_provision.plant import owner as owning
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.plant.jobs import digest_of_file, find_job, take_job, take_received
+from teds_provision.plant.jobs import close_job, digest_of_file, find_job, take_job, take_received
 from teds_provision.plant.line import LineRun, Scans
 from teds_provision.plant.sign_requests import send_job
 from teds_provision.plant.verify_evidence import EvidenceAnchors
@@ -274,6 +274,15 @@ def test_a_closed_job_is_refused(owner: Station) -> None:
     owner.plant.line.set_job_state(line.job.id, "closed")
     with pytest.raises(PolicyError, match="closed"):
         LineRun(owner, line.job)
+
+
+def test_a_job_is_closed_once(owner: Station) -> None:
+    line = line_of(owner)
+    assert line.job is not None
+    close_job(owner, line.job)
+    before = owner.audit_log.newest(), owner.plant.outbox(1000)
+    close_job(owner, line.job)
+    assert (owner.audit_log.newest(), owner.plant.outbox(1000)) == before, "no second entry, no second event"
 
 
 def test_a_clock_that_is_put_back_reopens_no_job_whose_end_was_seen(
