@@ -51,9 +51,9 @@ def meet(
 
     Of several nodes on a bus it selects the only one that is not finished yet. ``before`` is called when the link is
     open and the wait has not begun: the time to ask for a passphrase. If no link was chosen, ``uuid`` is searched on
-    the named buses, else on the bus of its last contact, and then at the reader; a reader of config.toml is looked at
-    before the buses too. Raises NoReaderError,
-    NoNodeError after ``links.timeout`` seconds, AddressConflictError, UsageError if several nodes qualify.
+    the named buses, else on the bus of its last contact, and then at the reader; a reader of config.toml is checked
+    briefly before the buses as well. Raises NoReaderError, NoNodeError after ``links.timeout`` seconds,
+    AddressConflictError, UsageError if several nodes qualify.
     """
     if uuid is None:
         port = open_port(links)
@@ -84,7 +84,7 @@ def _met_at(
     *,
     quietly: bool = False,
 ) -> Iterator[Conversation]:
-    """Meet this one node on the one link that ``links`` name; ``quietly`` without notices while it is searched."""
+    """Meet this one node on the one link that ``links`` name; ``quietly``: without notices during the search."""
 
     def wanted(identity: Identity) -> bool:
         return identity.uuid == uuid

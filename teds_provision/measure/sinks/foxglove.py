@@ -98,8 +98,8 @@ class FoxgloveSink(ThreadedSink):
             every = [facts_as_json(known) for known in self._facts.values() if known.uuid == uuid]
             topic = self._sheets[uuid] = self._topics.of_node(uuid, "teds")
             published.latest[topic] = self._text(topic, json.dumps({"uuid": uuid, "channels": every}), time.time())
-        anew = own.keys() | set(renamed)
-        self._streams = {key: value for key, value in self._streams.items() if key[0] not in anew}
+        outdated = own.keys() | set(renamed)
+        self._streams = {key: value for key, value in self._streams.items() if key[0] not in outdated}
 
     def _channel(self, topic: str, kind: str, definition: str, metadata: dict[str, str]) -> foxglove.Channel:
         assert self._published is not None
