@@ -5,6 +5,20 @@ from __future__ import annotations
 from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
+    Pattern(
+        "who measures under our address is known by its own frames",
+        "rival_measures",
+        "bus.conflicts.frames_within(within=LISTENING + SIGN_OF_LIFE)",
+        "bus.conflicts.seen_within()",
+        "tests/links/can/test_can_many.py",
+    ),
+    Pattern(
+        "late replies to a process before this one are no rival",
+        "AddressConflicts.record_unsolicited",
+        "now < self._opened + _LATE_REPLIES_SECONDS",
+        "False",
+        "tests/links/can/test_can_many.py",
+    ),
     # what a draw of changes found that no test noticed (protocol, station, handover, teds)
     Pattern(
         "strangers ask About once a second while a stream runs",

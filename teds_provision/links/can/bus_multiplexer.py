@@ -161,13 +161,16 @@ class BusReader:
 _KEPT: Final = 64
 _FRAMES_NEEDED: Final = 2
 _REPLIES_NEEDED: Final = 4
+_LATE_REPLIES_SECONDS: Final = 3.0
+"""After the bus was opened: replies of busy nodes to a process that ended just before this one began."""
 
 
 class AddressConflicts:
     """Detects other stations that use our address ``own``. Thread-safe."""
 
-    def __init__(self, own: int) -> None:
-        self._own = own
+    def __init__(self, own: int, now: Callable[[], float] = time.monotonic) -> None:
+        self._own, self._now = own, now
+        self._opened = now()
         self._frames: list[float] = []
         self._replies: list[float] = []
         self._lock = threading.Lock()
@@ -176,23 +179,31 @@ class AddressConflicts:
         """Look at a frame of the bus that we did not send."""
         if frame.identifier & 0xFF == self._own and _of_a_station(frame.identifier):
             with self._lock:
-                self._frames.append(time.monotonic())
+                self._frames.append(self._now())
                 del self._frames[:-_KEPT]
 
     def record_unsolicited(self, node: int) -> None:
-        """Record an unsolicited reply."""
+        """Record an unsolicited reply, unless it can be the answer to a process before this one."""
         del node
+        now = self._now()
+        if now < self._opened + _LATE_REPLIES_SECONDS:
+            return
         with self._lock:
-            self._replies.append(time.monotonic())
+            self._replies.append(now)
             del self._replies[:-_KEPT]
+
+    def frames_within(self, *, within: float) -> bool:
+        """Return True if another station sent from our address within these seconds; replies do not count."""
+        since = self._now() - within
+        with self._lock:
+            return sum(at >= since for at in self._frames) >= _FRAMES_NEEDED
 
     def seen_within(self, *, within: float = 10.0) -> bool:
         """Return True if another station used our address within these seconds."""
-        since = time.monotonic() - within
+        since = self._now() - within
         with self._lock:
-            frames = sum(at >= since for at in self._frames)
             replies = sum(at >= since for at in self._replies)
-        return frames >= _FRAMES_NEEDED or replies >= _REPLIES_NEEDED
+        return self.frames_within(within=within) or replies >= _REPLIES_NEEDED
 
     @property
     def text(self) -> str:

@@ -84,14 +84,18 @@ class CanStreams:
 
 
 def rival_measures(bus: BusMultiplexer) -> bool:
-    """Return True if data comes for our source address, and another station sends from it; takes 4 s at most."""
+    """Return True if data comes for our source address, and another station sends from it; takes 4 s at most.
+
+    Replies that this process did not request are no sign: nodes that go on streaming after a process ended may still
+    answer its last requests.
+    """
     own = bus.own & 7
     with bus.listen(lambda frame: _is_data_for(frame, own), most=64) as listener:
         if listener.get(LISTENING) is None:
             return False
     until = time.monotonic() + SIGN_OF_LIFE
     while time.monotonic() < until:
-        if bus.conflicts.seen_within():
+        if bus.conflicts.frames_within(within=LISTENING + SIGN_OF_LIFE):
             return True
         time.sleep(0.05)
     return False

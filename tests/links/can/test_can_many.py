@@ -13,9 +13,11 @@ import pytest
 
 from teds_provision.doctor import links as doctor
 from teds_provision.doctor.checks import System
-from teds_provision.errors import LinkClosedError, LinkError, NodeSilentError, UsageError
+from teds_provision.errors import AddressConflictError, LinkClosedError, LinkError, NodeSilentError, UsageError
 from teds_provision.links import LINKS, Contact, LinkSettings, Notice, open_place, open_port
+from teds_provision.links.can import bus_multiplexer, data_streams
 from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.bus_multiplexer import AddressConflicts
 from teds_provision.links.can.port import CanPort, _patience
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.protocol.messages.identity import Identity
@@ -225,6 +227,56 @@ def test_an_interface_that_gives_back_our_own_frames_makes_no_rival(group: str, 
     bus.close()
     until(port.bus().conflicts.seen_within)
     port.close()
+
+
+def test_replies_to_a_process_that_ended_just_before_are_no_rival() -> None:
+    now = [100.0]
+    conflicts = AddressConflicts(0xF1, lambda: now[0])
+
+    def four_replies() -> None:
+        for node in range(4):
+            conflicts.record_unsolicited(0x21 + node)
+
+    now[0] = 102.9
+    four_replies()
+    assert not conflicts.seen_within()
+    now[0] = 103.1
+    four_replies()
+    assert conflicts.seen_within()
+    assert not conflicts.frames_within(within=10)
+    now[0] = 120.0
+    assert not conflicts.seen_within()
+
+
+def test_who_measures_under_our_address_is_known_by_its_own_frames(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes stream on after a process was killed, and answer its last requests: that is no other station."""
+    monkeypatch.setattr(data_streams, "LISTENING", PATIENCE)
+    monkeypatch.setattr(data_streams, "SIGN_OF_LIFE", 0.5)
+    monkeypatch.setattr(bus_multiplexer, "_LATE_REPLIES_SECONDS", 0.0)
+    port = CanPort(hub.spec)
+    stop = threading.Event()
+    rival = threading.Event()
+
+    def node_goes_on() -> None:
+        while not stop.wait(0.02):
+            hub.send(0x1CFF2021, bytes(8))  # data for 0xF1
+            hub.send(0x18DAF121, b"\x02\x63\x01\xcc\xcc\xcc\xcc\xcc")
+            if rival.is_set():
+                hub.send(0x18DA21F1, b"\x02\x64\x03\xcc\xcc\xcc\xcc\xcc")
+
+    thread = threading.Thread(target=node_goes_on)
+    thread.start()
+    try:
+        until(port.bus().conflicts.seen_within)  # by replies alone
+        port.require_sole_source()
+        rival.set()
+        until(lambda: port.bus().conflicts.frames_within(within=10))
+        with pytest.raises(AddressConflictError, match="0xF1"):
+            port.require_sole_source()
+    finally:
+        stop.set()
+        thread.join()
+        port.close()
 
 
 def test_the_registry_opens_a_place_and_names_what_it_does_not_know(hub: Hub) -> None:
