@@ -32,10 +32,9 @@ class FolderTransport:
     returned: Returned | None = None
 
     def __init__(self, folder: Path) -> None:
-        if not folder.is_dir():
-            raise LinkError(f"There is no folder {folder}.", hint="Create it, or plug in the stick.")
         self._folder = folder
         self.where = str(folder)
+        self._require()
 
     def registry(self) -> str | None:
         """Return None: a folder does not name its registry; its rosters do."""
@@ -105,6 +104,10 @@ class FolderTransport:
 
     # -- files -----------------------------------------------------------------------------------------------------
 
+    def _require(self) -> None:
+        if not self._folder.is_dir():
+            raise LinkError(f"There is no folder {self._folder}.", hint="Create it, or plug in the stick.")
+
     def _put(self, folder: Path, n: int, hash: str, octets: bytes) -> None:
         self._make(folder)
         for path in (folder / f"{n}.jws", folder / f"{n}.{hash[:16]}.jws"):
@@ -119,6 +122,7 @@ class FolderTransport:
         write_new(path, octets, mode=SHARED, failure=LinkError)
 
     def _make(self, folder: Path) -> None:
+        self._require()  # a stick that was unplugged: its mount point must not be made again on the disk below
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -170,6 +170,12 @@ class Inbox:
         if self._listener is not None:
             self._listener.interrupt()
 
+    def start_over(self) -> None:
+        """Give everything that is still there once more: the registry or the folder was out of reach meanwhile."""
+        self.close()
+        self._known.clear()
+        self._hears = isinstance(self._transport, postgres.PostgresTransport)
+
     def close(self) -> None:
         """Let go of the connection that listens."""
         if self._listener is not None:

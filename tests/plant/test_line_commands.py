@@ -273,6 +273,27 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     assert "nothing received" not in owner.run("job", "status", made["id"], tmp_path / "proof").out
 
 
+def test_an_office_waits_while_its_folder_or_registry_is_out_of_reach(
+    desk: Desk, owner: Station, west: Station, tmp_path: Path
+) -> None:
+    """A database that restarted ended the office: the line stood still until a person started it again."""
+    stick, job = tmp_path / "stick", tmp_path / "one.jws"
+    (stick / "to").mkdir(parents=True)
+    more = ("--count", 1, "--output", job, "--sign", "owner")
+    made = owner.ask("job", "new", "--title", "one", "--profile", ANGLE, "--station", "west", *ENDS, *more)
+    office = owner.start("--json", "signer", "run", "--job", made["id"], "--files", stick)
+    (stick / "to").rmdir()
+    (stick / "to").symlink_to("to")  # a loop: reading it fails, for root too
+    office.wait_for("Requests wait")
+    (stick / "to").unlink()
+    office.wait_for("signing continues")
+    node = desk.node().start()
+    assert west.provision("nfc", "--job", job, "--files", stick)["verdict"] == "authentic"
+    assert office.wait_for_lines(1)[0]["uuid"] == node.uuid
+    office.signal(15)
+    assert office.end().code == 0
+
+
 @pytest.mark.system
 @pytest.mark.slow
 @pytest.mark.nightly(

@@ -6,6 +6,7 @@ import threading
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer_all
-from teds_provision.plant.sign_requests import Inbox, RemoteOffice, send_job
+from teds_provision.plant.postgres import PostgresTransport
+from teds_provision.plant.sign_requests import Inbox, OfficeSilentError, RemoteOffice, send_job
 from teds_provision.plant.sync import sync
 from teds_provision.plant.transport import Parcel
 from teds_provision.plant.yield_stats import attempts_of
@@ -96,6 +98,41 @@ def test_a_request_that_its_office_took_away_is_there_again_when_it_is_asked_aga
     assert [parcel.id for parcel in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
     at_office.close()
     at_line.close()
+
+
+def test_a_request_whose_answer_did_not_leave_is_answered_after_the_registry_is_back(plant: Office) -> None:
+    """An office that goes on had taken the request for given already: the line waited until the next start."""
+    north, west = plant.north, plant.member("west", "line")
+    north.unlock()
+    west.unlock()
+    members = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 1}}
+    job = take_job(north, job_of(north, **members, count=1))
+    at_office, at_line = plant.transport(north), plant.transport(west)
+    send_job(north, at_office, job)
+    plant.sync(north, west)
+    asks = RemoteOffice(west, at_line, 0)
+    with pytest.raises(OfficeSilentError):
+        build(LineRun(west, find_job(west, job.id), office=asks), make_board(1))
+    inbox = Inbox(north, at_office, SIGN_REQUEST)
+    lost = SendlessTransport(at_office)
+    with pytest.raises(RegistryError):
+        list(answer_all(north, lost, inbox, [job.id]))  # type: ignore[arg-type]
+    inbox.start_over()
+    assert [answered.answer.refused for answered in answer_all(north, at_office, inbox, [job.id])] == [""]
+    assert list(answer_all(north, at_office, inbox, [job.id])) == []
+    asks.close()
+    inbox.close()
+    at_office.close()
+
+
+@dataclass
+class SendlessTransport:
+    """A transport whose connection is lost when an answer is to leave."""
+
+    transport: PostgresTransport
+
+    def send(self, parcel: Parcel) -> None:
+        raise RegistryError("Cannot use the registry: the connection was closed.")
 
 
 def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:

@@ -17,7 +17,7 @@ from teds_provision.handover import deny
 from teds_provision.plant.apply_pages import heads_digest, merged_views
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import resume, sync
-from teds_provision.plant.transport import CarriedPage
+from teds_provision.plant.transport import CarriedPage, Parcel
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.event import hash_of_statement
@@ -407,3 +407,14 @@ def test_a_page_of_another_history_is_stored_beside_the_first_one(tmp_path: Path
     for octets in (b"h.one.s", b"h.another.s", b"h.another.s"):
         folder.append(station, 1, "", hash_of(octets), octets)
     assert sorted(page.octets for page in folder.pages(station, 0)) == [b"h.another.s", b"h.one.s"]
+
+
+def test_a_stick_that_was_unplugged_is_not_made_anew_on_the_disk_below(tmp_path: Path) -> None:
+    """A line that runs on wrote its request into an empty mount point, and waited for an answer that never came."""
+    stick = tmp_path / "stick"
+    stick.mkdir()
+    transport = FolderTransport(stick)
+    stick.rmdir()
+    with pytest.raises(LinkError, match="There is no folder"):
+        transport.send(Parcel("0b5f0b5f-0b5f-4b5f-8b5f-0b5f0b5f0b5f", "0" * 64, b"{}", "2099-01-01T00:00:00Z"))
+    assert not stick.exists()

@@ -25,7 +25,7 @@ from teds_provision.cli.options import (
     examples,
 )
 from teds_provision.cli.rendering import local_time, moment, print_table
-from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
+from teds_provision.errors import BadDataError, LinkError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import json_files
 from teds_provision.lazy import late
 from teds_provision.protocol.keys import SoftwareKey, from_pem
@@ -404,6 +404,8 @@ for subcommand in (new, list_jobs, show, send, close, status):
 
 _LOOK_SECONDS = 0.2
 _MOST_WAIT_SECONDS = 1.0
+_MOST_RETRY_SECONDS = 30.0
+"""Seconds at most between two tries while the registry or the folder is out of reach."""
 
 
 @click.group(
@@ -432,7 +434,8 @@ def signer() -> None:
 def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None) -> None:
     """Answer requests until Ctrl-C, one line each.
 
-    A request is signed if its board signed it, its job allows it, and the datasheet built here is the same.
+    A request is signed if its board signed it, its job allows it, and the datasheet built here is the same. While the
+    registry or the folder is out of reach, requests wait.
     """
     station = app.station()
     ids = {plant.jobs.find_job(station, job).id for job in jobs}
@@ -446,13 +449,24 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     if seconds is not None:
         threading.Timer(seconds, stop.set).start()
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
-    while True:
+    again = 0.0  # seconds to the next try; 0 while requests arrive
+    while not stop.is_set():
         station.unlock()  # ends with vault-locked if another command changed passphrase and master key
-        for answered in plant.office.answer_all(station, transport, inbox, ids, stop=stop.is_set):
-            _print_answer(app, station, answered)
-        if stop.is_set():
-            return
-        inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
+        try:
+            for answered in plant.office.answer_all(station, transport, inbox, ids, stop=stop.is_set):
+                _print_answer(app, station, answered)
+        except LinkError as error:
+            if not again:
+                app.warn(f"{error.message.rstrip('.')}. Requests wait; trying again until Ctrl-C.")
+            again = min(2 * again or _MOST_WAIT_SECONDS, _MOST_RETRY_SECONDS)
+            inbox.start_over()
+            stop.wait(again)
+        else:
+            if again:
+                app.warn(f"{transport.where} can be used again; signing continues.")
+                again = 0.0
+            if not stop.is_set():
+                inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
 
 
 @command(
