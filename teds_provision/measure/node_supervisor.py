@@ -107,7 +107,6 @@ class NodeSupervisor:
         self._retry_policy = RetryPolicy(None)
         self._standing: NodeStanding | None = None  # of the current try
         self.sighting: Sighting | None = None  # its last place
-        self._halved = 0
         self._lease, self._claimed = request.lease, [0]
         self._driven: TopicActuators | None = None
         self._told = ""
@@ -447,13 +446,14 @@ class NodeSupervisor:
         self, bus: MeasuredBus, trusted: VerifiedSession, channels: list[Channel], address: int
     ) -> NodePlans:
         rate, share = self._request.rate, bus.share
+        halved = 0  # anew in each session: other firmware may allow what the last one refused
         if rate is None:
-            share.announce_share(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
+            share.announce_share(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON, halved).load)
         start = self._common_start.start(self.uuid, self.streams.clock)
         while True:
             with share.lock:
                 time_left = bus.time_for(share.for_node(self.uuid, sharing=rate is None), address)
-                plans = self._plan(channels, time_left, start)
+                plans = self._plan(channels, time_left, start, halved)
                 share.taken[self.uuid] = plans.load
             try:
                 for plan in plans.streams:
@@ -462,16 +462,16 @@ class NodeSupervisor:
                 if refusal.reason == Reason.TOO_LATE and start != SOON:
                     self._common_start.start_by_itself(self.uuid)
                     start = SOON
-                elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
+                elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or halved >= SLOWER:
                     raise
                 else:
                     # the firmware's shortest period may be longer than the datasheet's, and no command reports it
-                    self._halved += 1
+                    halved += 1
                 self.streams.stop(bus, trusted, address)
                 continue
             return plans
 
-    def _plan(self, channels: list[Channel], bus: BusTime, start: int) -> NodePlans:
+    def _plan(self, channels: list[Channel], bus: BusTime, start: int, halved: int) -> NodePlans:
         return plan_node(
             channels,
             bus,
@@ -479,7 +479,7 @@ class NodeSupervisor:
             kind=self._request.stream_kind,
             test_pattern=self._request.test_pattern,
             start=start,
-            slower=2**self._halved,
+            slower=2**halved,
             at_most=self._request.newcomers,
         )
 

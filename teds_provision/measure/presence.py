@@ -18,14 +18,16 @@ from teds_provision.links.discovery import Sighting
 from teds_provision.protocol.announce import Announce, uuid_crc
 
 RECENT = 30.0  # seconds for which an address conflict is reported as the reason why a node is not found
-MOST = 1024  # UUIDs kept: a bus has 239 addresses, but a device at any of them can invent new UUIDs
+# UUIDs kept beside those that are measured: a bus has 239 addresses, but a device at any of them can invent new UUIDs
+MOST = 1024
 REPEATED = 600.0  # seconds until the same address conflict is reported again
 ROUND = 0.7  # seconds of two broadcasts, after which two boards at one address are noticed
 TWIN = 0.5  # seconds to wait for the real node after another device used its UUID
 
 
 Place = tuple[str, int]
-_Key = TypeVar("_Key", Place, int)
+_Key = TypeVar("_Key", Place, int, bytes)
+_Entry = TypeVar("_Entry", bytes, threading.Condition)
 
 
 @dataclass
@@ -51,7 +53,9 @@ class Presence:
     _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they appear
     _reported: dict[str, float] = field(default_factory=dict)  # notes that were made, with their times
     gone: int = 0  # how often a node became missing that had been seen, or was not searched for before
-    _turn: threading.Condition = field(default_factory=threading.Condition)
+    _turn: threading.Lock = field(default_factory=threading.Lock)
+    # by the node that a thread waits for: a sighting wakes the threads of its own node alone, however many others wait
+    _waiting: dict[bytes, set[threading.Condition]] = field(default_factory=dict)
 
     def add_sighting(self, sighting: Sighting) -> None:
         """Take a sighting; a supervisor that has this node at another place is notified."""
@@ -61,9 +65,9 @@ class Presence:
             places = self._seen.pop(sighting.uuid, {})  # the latest sighting is last
             places[place] = sighting
             self._seen[sighting.uuid] = places
-            while len(self._seen) > MOST:
+            while len(self._seen) > MOST + len(self._announced):
                 del self._seen[next(uuid for uuid in self._seen if uuid not in self._announced)]
-            self._turn.notify_all()
+            self._wake(sighting.uuid)
             kept = self._announced.get(sighting.uuid)
         if kept is not None and kept[0] != place:
             kept[2]()
@@ -75,7 +79,8 @@ class Presence:
             self._conflicts[place, address] = time.monotonic(), error
             for places in self._seen.values():
                 places.pop((place, address), None)
-            self._turn.notify_all()
+            for uuid in self._waiting:
+                self._wake(uuid)
         self.report(error.message)
 
     def report(self, text: str) -> None:
@@ -159,7 +164,7 @@ class Presence:
     def find(self, uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float = 0.0) -> Sighting:
         """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNodeError, AddressConflictError."""
         until = time.monotonic() + seconds
-        with self._turn, self._waited_for(uuid):
+        with self._turn, self._waited_for(uuid), self._news_of(uuid) as news:
             while True:
                 found = self._best(uuid, fresh)
                 if found is not None:
@@ -170,7 +175,7 @@ class Presence:
                 left = until - time.monotonic()
                 if left <= 0 or stop.is_set():
                     raise self._nobody(uuid, seconds)
-                self._turn.wait(min(left, 0.2))
+                news.wait(min(left, 0.2))
 
     @contextmanager
     def _waited_for(self, uuid: bytes) -> Iterator[None]:
@@ -183,6 +188,20 @@ class Presence:
         finally:
             _take_one(self._missing, uuid)
             _take_one(self._missing_crcs, crc)
+
+    @contextmanager
+    def _news_of(self, uuid: bytes) -> Iterator[threading.Condition]:
+        """Give a thread that has the turn what news of one node wake."""
+        news = threading.Condition(self._turn)
+        self._waiting.setdefault(uuid, set()).add(news)
+        try:
+            yield news
+        finally:
+            _discard(self._waiting, uuid, news)
+
+    def _wake(self, uuid: bytes) -> None:
+        for news in self._waiting.get(uuid, ()):
+            news.notify()
 
     def search_again(self, sighting: Sighting) -> None:
         """Record that it was not that node, or is gone from there, and search again."""
@@ -203,8 +222,8 @@ class Presence:
             places = self._seen.get(uuid, {}).keys() | self._wrong.get(uuid, {}).keys()
             return len(places) > 1 or any(map(self._conflict_at, places))
 
-        with self._turn:
-            return self._turn.wait_for(other, TWIN + ROUND)
+        with self._turn, self._news_of(uuid) as news:
+            return news.wait_for(other, TWIN + ROUND)
 
     def conflict_at(self, sighting: Sighting) -> AddressConflictError | None:
         """Return the error if two boards were heard at the address of a sighting a short while ago."""
@@ -250,8 +269,8 @@ def _take_one(counts: Counter[Any], key: object) -> None:
         del counts[key]
 
 
-def _discard(index: dict[_Key, set[bytes]], key: _Key, uuid: bytes) -> None:
-    """Remove a node from an index, and its key if no node is left."""
-    index[key].discard(uuid)
+def _discard(index: dict[_Key, set[_Entry]], key: _Key, entry: _Entry) -> None:
+    """Remove an entry from an index, and its key if none is left."""
+    index[key].discard(entry)
     if not index[key]:
         del index[key]

@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -162,7 +163,7 @@ def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
         sightings.add_sighting(seen(number.to_bytes(10, "big"), number % 239))
         if number % 100 == 0:
             sightings.add_sighting(seen(ONE, 7))  # answers now and then, as everyone is asked every 30 s
-    assert len(sightings.all()) <= MOST
+    assert len(sightings.all()) <= MOST + 1, "beside the one that is measured"
     assert {ONE, TWO} <= {sighting.uuid for sighting in sightings.all()}
 
 
@@ -317,6 +318,41 @@ def test_a_node_is_missing_until_the_last_of_those_who_wait_for_it_has_gone() ->
     waiting.join(PATIENCE)
     assert found.is_set()
     assert not sightings.missing()
+
+
+def test_a_sighting_wakes_those_alone_who_wait_for_that_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand nodes that begin together would wake each other half a million times."""
+    sightings, woken = Presence(), list[str]()
+
+    def notified(waits: threading.Condition) -> None:
+        woken.append(next(name for name, own in conditions.items() if own is waits))
+
+    with sightings._turn, ExitStack() as waiting:
+        names = {"one": ONE, "one again": ONE, "two": TWO, "three": THREE}
+        conditions = {name: waiting.enter_context(sightings._news_of(uuid)) for name, uuid in names.items()}
+        monkeypatch.setattr(threading.Condition, "notify", notified)
+        sightings._turn.release()
+        try:
+            sightings.add_sighting(seen(TWO, 7))
+            assert woken == ["two"]
+            sightings.add_sighting(seen(ONE, 8))
+            assert sorted(woken[1:]) == ["one", "one again"]
+            sightings.conflict("can:x", 9, conflict(9))
+            assert len(woken) == 3 + 4, "whoever may have been at that address"
+        finally:
+            sightings._turn.acquire()
+    assert not sightings._waiting
+
+
+def test_a_measured_node_is_never_forgotten_however_many_are_measured() -> None:
+    """More than 1024 on the buses of one process: the one that answers last is found like the first."""
+    sightings, measured = Presence(), [number.to_bytes(10, "big") for number in range(1100)]
+    for uuid in measured:
+        sightings.add_sighting(seen(uuid, 7))
+        sightings.on_announce(find(sightings, uuid), lambda: None)
+    for uuid in (measured[0], measured[-1]):
+        sightings.add_sighting(seen(uuid, 7))
+    assert {sighting.uuid for sighting in sightings.all()} == {*measured}
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -297,3 +298,57 @@ def test_an_announce_is_settled_by_a_value_and_a_sighting_elsewhere_is_one_too(m
     assert supervisor._is_gone(), "its answers come from there now: this one is not waited for"
     with pytest.raises(LinkError, match="restarted, or now answers elsewhere"):
         supervisor._doubted(now[0])
+
+
+@pytest.mark.parametrize(
+    ("rate", "refusals", "plans", "raised"),
+    [
+        (None, [], [(700, 1)], None),
+        (None, [Reason.OUT_OF_RANGE] * 3, [(700, 1), (700, 2), (700, 4), (700, 8)], None),
+        (None, [Reason.OUT_OF_RANGE] * 11, [(700, 2**halved) for halved in range(11)], Reason.OUT_OF_RANGE),
+        (50.0, [Reason.OUT_OF_RANGE], [(700, 1)], Reason.OUT_OF_RANGE),
+        (50.0, [Reason.TOO_LATE], [(700, 1), (0, 1)], None),
+        (None, [Reason.TOO_LATE, Reason.OUT_OF_RANGE], [(700, 1), (0, 1), (0, 2)], None),
+        (None, [Reason.TOO_LATE] * 2, [(700, 1), (0, 1)], Reason.TOO_LATE),
+        (None, [Reason.DOES_NOT_FIT], [(700, 1)], Reason.DOES_NOT_FIT),
+    ],
+)
+def test_a_refused_subscribe_is_tried_slower_or_at_once_and_as_at_first_in_the_next_session(
+    rate: float | None,
+    refusals: list[Reason],
+    plans: list[tuple[int, int]],
+    raised: Reason | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A node whose new firmware allows shorter periods would stay as slow as its old one was."""
+    supervisor = supervisor_at([0.0], monkeypatch, rate=rate)
+    tried, stops, left = list[tuple[int, int]](), list[int](), list[Reason]()
+
+    def plan(_channels: object, _bus: object, *, start: int, slower: int, **_more: object) -> Any:
+        tried.append((start, slower))
+        return SimpleNamespace(load=0.1, streams=[SimpleNamespace()])
+
+    def subscribe(*_how: object, **_more: object) -> None:
+        if left:
+            raise NodeRefusedError("No.", reason=left.pop(0))
+
+    streams = SimpleNamespace(subscribe=subscribe, stop=lambda _bus, _trusted, at: stops.append(at), clock=None)
+    together = SimpleNamespace(
+        start=lambda _uuid, _clock: 700, seconds_until=lambda _start: 0.0, start_by_itself=lambda _uuid: None
+    )
+    monkeypatch.setattr(supervisor, "streams", streams)
+    monkeypatch.setattr(supervisor, "_common_start", together)
+    monkeypatch.setattr(node_supervisor, "plan_node", plan)
+    share = BusShare(cast(Any, None))
+    bus = cast(Any, SimpleNamespace(share=share, time_for=lambda _time, _address: None))
+    monkeypatch.setattr(share, "for_node", lambda _uuid, *, sharing: None)
+    for _session in range(2):
+        tried.clear()
+        stops.clear()
+        left[:] = refusals
+        with pytest.raises(NodeRefusedError) if raised is not None else nullcontext() as refused:
+            supervisor._subscribe(bus, cast(Any, None), [], 9)
+        assert tried[rate is None :] == plans, "the first one is the share that is announced"
+        assert stops == [9] * (len(plans) - 1), "what began of a refused plan is stopped"
+        assert raised is None or cast(Any, refused).value.reason == raised
+        assert share.taken == {UUID: 0.1}

@@ -156,6 +156,20 @@ def test_a_stranger_that_gives_its_name_up_is_announced_again() -> None:
     assert {uuid for uuid, _ in sink._owed_entities} == {uuid_of(1).hex(), uuid_of(2).hex()}
 
 
+def test_a_stranger_touches_those_alone_that_it_renames() -> None:
+    """What is kept of all other nodes, topics and descriptions, would be made anew for each of them."""
+    topics = Topics(StationFacts("bench"))
+    for number in range(4):
+        topics.learn((facts_of(number),))
+    number = ANGLE.number
+    before = [topics.channel(uuid_of(n).hex(), number) for n in range(4)]
+    assert topics.learn((facts_of(9),)) == {uuid_of(9).hex()}
+    assert topics.learn((replace(facts_of(5), node="node 1"),)) == {uuid_of(5).hex(), uuid_of(1).hex()}
+    after = [topics.channel(uuid_of(n).hex(), number) for n in range(4)]
+    assert before[1] == "/bench/node_1/" + after[0].rpartition("/")[2]
+    assert after == [before[0], before[1].replace("node_1", "node_1_00000000000000000001"), *before[2:]]
+
+
 @pytest.mark.parametrize("kinds", [("sensor",), ("actuator", "sensor")], ids=["a sensor", "a joint"])
 def test_the_topics_of_a_node_that_joins_ros(kinds: tuple[Literal["actuator", "sensor"], ...]) -> None:
     def channels(number: int) -> tuple[ChannelFacts, ...]:

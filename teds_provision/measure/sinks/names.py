@@ -97,8 +97,12 @@ class Topics:
             channels.update({channel_facts.number: channel_facts.name, **dict(channel_facts.siblings)})
             self._made.pop(channel_facts.uuid, None)
         if len(self._strangers) != strangers:
+            before = self._nodes
             self._name_nodes()
-            touched |= self._nodes.keys()
+            renamed = {uuid for uuid, name in self._nodes.items() if before.get(uuid) != name}
+            for uuid in renamed:
+                self._made.pop(uuid, None)
+            touched |= renamed
         return touched
 
     def _has_others(self, uuid: str, chosen: Mapping[int, str]) -> bool:
@@ -129,7 +133,6 @@ class Topics:
             }
             self._nodes |= _apart(wishes, more, taken)
             taken |= set(self._nodes.values())
-        self._made = {}
 
     def _own_name(self, uuid: str, name: str) -> str:
         """Return the name, with its own digits behind it if it ends in those of another node.

@@ -9,9 +9,11 @@ import json
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +34,9 @@ from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
 from teds_provision.measure.sinks.mcap.recover import recover
-from teds_provision.measure.sinks.mcap.writer import MAGIC
+from teds_provision.measure.sinks.mcap.writer import MAGIC, McapSummary, text
+from teds_provision.measure.sinks.mcap.writer import record as mcap_record
+from teds_provision.measure.sinks.mcap.zstandard_frames import compress_frame
 from tests.cli.shell import call, unmeasured_environment
 from tests.faults.disk import build_library, put_back
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks, fill
@@ -415,6 +419,35 @@ def test_no_octet_that_is_wrong_costs_more_than_its_chunk_or_changes_the_file(lo
             assert path.read_bytes() == bytes(hurt)
         if done.output is not None:
             assert len(readable(done.output)) >= len(before) - 3
+
+
+@pytest.mark.parametrize("summary", ["whole", "damaged", "says nothing of it"])
+def test_topics_of_a_damaged_chunk_come_from_the_summary_then_from_the_chunk(tmp_path: Path, summary: str) -> None:
+    """The summary has a checksum that is right, the damaged chunk has one that is wrong."""
+    kind = text("std_msgs/msg/Float64") + text("ros2msg") + text("float64 data")
+    schema = mcap_record(0x03, struct.pack("<H", 1) + kind)
+    topic = mcap_record(0x04, struct.pack("<HH", 1, 1) + text("/bench/x") + text("cdr") + struct.pack("<I", 0))
+    message = mcap_record(0x05, struct.pack("<HIQQ", 1, 0, 5, 5) + bytes(8))
+    packed = compress_frame(message)
+    content, whole = schema + topic, McapSummary()
+    octets = MAGIC + mcap_record(0x01, text("ros2") + text(""))
+    head = struct.pack("<QQQI", 0, 0, len(content), zlib.crc32(content)) + text("") + struct.pack("<Q", len(content))
+    octets += mcap_record(0x06, head + content.replace(b"/bench/x", b"/bench/y"))
+    head = struct.pack("<QQQI", 5, 5, len(message), zlib.crc32(message)) + text("zstd")
+    octets += mcap_record(0x06, head + struct.pack("<Q", len(packed)) + packed)
+    if summary != "says nothing of it":
+        whole.schemas, whole.channels = {1: schema}, {1: topic}
+    octets += whole.tail(len(octets))
+    if summary == "damaged":
+        octets = octets[:-20] + bytes([octets[-20] ^ 1]) + octets[-19:]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(octets)
+    done = recover(path)
+    assert done.output is not None
+    with done.output.open("rb") as file:
+        found = [(schema.name, schema.data, channel.topic) for schema, channel, _ in make_reader(file).iter_messages()]
+    name = "/bench/x" if summary == "whole" else "/bench/y"
+    assert found == [("std_msgs/msg/Float64", b"float64 data", name)]
 
 
 @settings(max_examples=60, deadline=None)

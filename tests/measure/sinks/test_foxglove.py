@@ -109,7 +109,23 @@ def test_only_this_machine_is_served_unless_a_name_is_allowed_and_tls_is_there(t
     for address in ("127.0.0.1:x", "127.0.0.1:65536", "localhost"):
         with pytest.raises(UsageError, match="no address"):
             address_of(address, open_)
-    assert open_.url("ws", "0.0.0.0", 8765) == "wss://bench:8765"
+
+
+@pytest.mark.parametrize(
+    ("allow", "host", "url"),
+    [
+        ((), "127.0.0.1", "ws://127.0.0.1:8765"),
+        ((), "::1", "ws://[::1]:8765"),
+        ((), "0.0.0.0", "ws://0.0.0.0:8765"),
+        (("bench", "bench.local"), "0.0.0.0", "wss://bench:8765"),
+        (("bench", "bench.local"), "::", "wss://bench:8765"),
+        (("2001:db8::1",), "::", "wss://[2001:db8::1]:8765"),
+        (("bench",), "192.168.1.2", "wss://192.168.1.2:8765"),
+    ],
+)
+def test_an_address_for_people_is_one_that_a_client_can_use(allow: tuple[str, ...], host: str, url: str) -> None:
+    certificate = Path("cert.pem") if allow else None
+    assert Exposure(allow, certificate, certificate).url("ws", host, 8765) == url
 
 
 def test_a_taken_port_is_reported() -> None:
