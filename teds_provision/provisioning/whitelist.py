@@ -412,14 +412,17 @@ def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPl
     new = 0
     for chunk in chunks(listed):
         uuids = [entry.uuid for entry in chunk]
-        present = station.pins.get_many(uuids)
-        pinned = station.pins.pinned_among(station.nodes.get_many(uuids).values(), present.values())
+        present, nodes = station.pins.get_many(uuids), station.nodes.get_many(uuids)
+        pinned = station.pins.pinned_among(nodes.values(), present.values())
         for entry in chunk:
             known, pin = present.get(entry.uuid), pinned.get(entry.uuid)
             if pin is not None and entry.fingerprint is not None and not same_key(pin, entry.fingerprint):
                 conflicts.append((entry, pin))
                 continue
-            wanted = _merged(known, entry)
+            node = nodes.get(entry.uuid)
+            # lists and exports show the node's own name where the entry has none: such a name changes nothing
+            is_own_name = known is not None and node is not None and entry.name == node.name
+            wanted = _merged(known, replace(entry, name=None) if is_own_name else entry)
             if wanted != known:
                 write.append(wanted)
                 new += known is None

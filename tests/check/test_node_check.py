@@ -319,6 +319,26 @@ def test_a_node_of_ours_that_opens_no_session_is_not_taken_for_another_owners(
     assert board.state.state == NodeState.KEYED
 
 
+def test_a_board_that_opened_no_session_before_its_reset_is_tried_again_after_it(station: Station) -> None:
+    """The rules after the reset were skipped for a fault that was over."""
+    board, opens = Board(), list[bytes]()
+    agreed(station, board)
+
+    def slips(_board: bench.Board, octets: bytes, reference: faulty.Next) -> bytes:
+        reply = reference(octets)
+        if octets[2:4] == b"\x80\x03" and len(octets) > 6:
+            opens.append(octets)
+            if len(opens) == 2:  # the first one is not a rule's
+                return reply[:-1] + bytes((reply[-1] ^ 1,))
+        return reply
+
+    report = checked(station, board, fault=slips)
+    assert names(report, "failed") == {"open"}
+    (skipped,) = [check for check in report.checks if check.rule == "sealed-tag"]
+    assert skipped.detail.startswith("Needs a session, and none opens: ")
+    assert {"agreement", "commit", "reset"} <= names(report, "passed")
+
+
 # -- the test agreement in the open ------------------------------------------------------------------------------------
 
 

@@ -70,6 +70,10 @@ def test_an_export_has_the_names_of_nodes_and_import_keeps_them(home: Path, tmp_
     path = tmp_path / f"list.{form}"
     exported = call(home, "whitelist", "export", path)
     assert exported.out == f"Wrote 1 entry as {form} to {path}.\n"
+    own = call(home, "whitelist", "import", path)
+    assert own.out == "Whitelist: 0 new, 0 changed, 1 unchanged (nothing to do).\n", (
+        "what it shows already is no change"
+    )
     other = tmp_path / "other"
     make_station(other).close()
     taken = call(other, "--json", "whitelist", "import", path)

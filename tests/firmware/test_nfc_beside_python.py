@@ -247,6 +247,35 @@ def test_what_a_deselected_tag_and_one_that_was_asked_nothing_reply() -> None:
     node.close()
 
 
+def test_a_reader_that_began_to_write_is_not_disturbed_by_a_new_initial_message() -> None:
+    """NFC Forum T4T: a length of 0, the message, then its length; Identify changes in between (a new CAN address)."""
+    node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
+    node.has_nfc()
+    assert node.start() == 0
+    number = 0
+
+    def apdu(octets: bytes) -> bytes | None:
+        nonlocal number
+        answer = node.nfc_frame(bytes((0x02 | number,)) + octets)
+        number ^= 1
+        return answer[1:] if answer is not None else None
+
+    node.nfc_frame(bytes.fromhex("e080"))
+    apdu(bytes.fromhex("00a4040007d276000085010100"))
+    assert apdu(bytes.fromhex("00a4000c02e104")) == b"\x90\x00"
+    assert apdu(bytes.fromhex("00d60000020000")) == b"\x90\x00"
+    node.take_can_address(99)
+    node.poll()
+    assert node.nfc_message() == b""
+    octets = message.encode([tnep.select(tnep.SERVICE)])
+    assert apdu(b"\0\xd6\0\2" + bytes((len(octets),)) + octets) == b"\x90\x00"
+    node.poll()
+    assert apdu(b"\0\xd6\0\0\2" + len(octets).to_bytes(2, "big")) == b"\x90\x00"
+    node.poll()
+    assert node.nfc_message() == message.encode([tnep.status(tnep.SUCCESS)])
+    node.close()
+
+
 @pytest.mark.parametrize("selection", [b"", b"\0", b"\x05abc", b"\x03abc", b"\x03abcd", b"\xff"], ids=bytes.hex)
 def test_a_selection_that_does_not_add_up(taps: Callable[[int, int], Taps], selection: bytes) -> None:
     """Alone, twice, and behind a request."""

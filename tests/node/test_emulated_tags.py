@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageError
-from teds_provision.node.nfc.server import ETU, AirTime, answer_seconds, command_seconds
+from teds_provision.links.nfc.nfcpy import nfc
+from teds_provision.node.nfc import server as server_module
+from teds_provision.node.nfc.server import ETU, AirTime, NfcServer, answer_seconds, command_seconds
 from teds_provision.node.nfc.tags import IsoDepTag, NdefApplication, Type2Memory, Type4Memory
+from teds_provision.node.nfc.tnep import ExtraRecords
 from tests.node.tag_talk import Handler
 from tests.pace import best_of
 
@@ -181,9 +186,111 @@ def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
 
 
 def test_a_tag_that_cannot_be_is_refused() -> None:
-    from teds_provision.node.nfc.server import NfcServer
-
     with pytest.raises(UsageError):
         NfcServer("udp:localhost:5000", Handler(), tag="2", uid=bytes(4))
     with pytest.raises(UsageError):
         NfcServer("udp:0.0.0.0:5000", Handler())
+
+
+# --- from one activation to the next ----------------------------------------------------------------------------------
+
+
+class Reader:
+    """A reader's field over the tag: what ``listen`` and ``exchange`` of nfcpy's front end give, in their order."""
+
+    def __init__(self, server: NfcServer, *said: Any) -> None:
+        self.server, self.said = server, list(said)
+        self.offers: list[Any] = []
+        self.answers: list[bytes | None] = []
+
+    def listen(self, offer: Any, timeout: float) -> Any:
+        self.offers.append(offer)
+        return self._next()
+
+    def exchange(self, answer: bytes | None, timeout: float) -> bytes:
+        self.answers.append(answer)
+        said = self._next()
+        if isinstance(said, Exception):
+            raise said
+        return bytes(said)
+
+    def close(self) -> None:
+        assert not self.said
+
+    def _next(self) -> Any:
+        if len(self.said) == 1:
+            self.server._stop.set()
+        return self.said.pop(0)
+
+
+class Place:
+    """A place on the reader that is free at the second look."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def bind(self) -> bool:
+        self.asked += 1
+        return self.asked != 2
+
+    def wake(self) -> None:
+        """Nothing waits on it."""
+
+
+def served(patch: pytest.MonkeyPatch, *said: Any, **how: Any) -> tuple[Reader, list[object]]:
+    """Return what a reader saw of a tag that it talked to so, and what the node learned of its field, in order."""
+    log: list[object] = []
+
+    class Logged(Handler):
+        def lost(self, link: str) -> None:
+            log.append("lost")
+
+    server = NfcServer("udp:localhost:5000", Logged(), extras=ExtraRecords(field=log.append), queue=True, **how)
+    reader = Reader(server, *said)
+    patch.setattr(server_module, "NodeDevice", lambda *_: Place())
+    patch.setattr(server_module, "frontend", lambda *_: reader)
+    server.start()
+    server._thread.join()
+    server.stop()
+    return reader, log
+
+
+@pytest.mark.parametrize(
+    ("tag", "uid", "sens", "sak"),
+    [
+        ("4", "08112233", "0400", "20"),
+        ("4", "04112233445566", "4400", "20"),
+        ("4", "04112233445566778899", "8400", "20"),
+        ("2", "04112233445566", "4400", "00"),
+    ],
+)
+def test_a_tag_is_activated_by_its_uid(
+    monkeypatch: pytest.MonkeyPatch, tag: Any, uid: str, sens: str, sak: str
+) -> None:
+    """ISO/IEC 14443-3: ATQA has the size of the UID, SAK whether ISO-DEP follows."""
+    reader, log = served(monkeypatch, None, tag=tag, uid=bytes.fromhex(uid))
+    (offer,) = reader.offers
+    assert offer.brty == "106A"
+    assert (offer.sens_res.hex(), offer.sdd_res.hex(), offer.sel_res.hex()) == (sens, uid, sak)
+    assert log == []
+
+
+def test_the_node_learns_when_the_field_comes_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A battery is charged in the field; sessions end with it. A frame lost on air ends nothing."""
+    first, second = (SimpleNamespace(tt2_cmd=None, tt4_cmd=rats) for rats in (b"\xe0\x80", b"\xe0\x80"))
+    gone, lost = nfc.clf.BrokenLinkError(), nfc.clf.TransmissionError()
+    on_air = (b"\xc2", lost, nfc.clf.TimeoutError(), b"\xb2", gone)
+    reader, log = served(monkeypatch, first, *on_air, None, second, gone, uid=bytes(4))
+    assert [event for event in log if event != "lost"] == [True, False, True, False]
+    assert log.count("lost") == 2, "the worker forgets, whenever it comes to it"
+    assert [answer.hex() if answer else answer for answer in reader.answers] == [
+        "057880b000", "c2", None, None, "a3", "057880b000",
+    ]  # fmt: skip
+
+
+def test_a_type_2_tag_answers_its_first_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, log = served(
+        monkeypatch, SimpleNamespace(tt2_cmd=b"\x30\x00", tt4_cmd=None), nfc.clf.BrokenLinkError(), tag="2", uid=UID
+    )
+    assert reader.answers == [Type2Memory(UID, 499).answer(b"\x30\x00")]
+    assert log == [True, False, "lost"]
