@@ -94,7 +94,16 @@ def bare(payload: bytes, north: jwk.JWK, south: jwk.JWK) -> tuple[float, float]:
     return min(timed(seal)[0] for _ in range(ROUNDS)), min(timed(open_)[0] for _ in range(ROUNDS))
 
 
-_TABLES = {"nodes": 1, "whitelist": 1, "keys": 0, "key_slots": 0, "holders": 0, "marks": 1}
+_TABLES = {
+    "nodes": 1,
+    "whitelist": 1,
+    "keys": 0,
+    "key_slots": 0,
+    "holders": 0,
+    "marks": 1,
+    "groups": 0,
+    "group_members": 0,
+}
 """What an import writes, and how many seals a row of it has."""
 
 

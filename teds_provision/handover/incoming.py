@@ -35,7 +35,16 @@ from teds_provision.station.groups import valid_name
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
 from teds_provision.station.store.database import chunks
-from teds_provision.station.store.records import Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.station.store.records import (
+    Handover,
+    Holder,
+    KeyRecord,
+    NewNode,
+    NewPin,
+    NodeRecord,
+    WhitelistEntry,
+    utc_now,
+)
 
 # The nodes in a bundle: what is done with each, and the rows of those that are accepted.
 
@@ -78,9 +87,13 @@ class ImportedRows:
             self.station.bulk.put(self._rows(taken))
 
     def _rows(self, taken: Sequence[PlannedNode]) -> BulkRows:
+        known_nodes = [(planned, self.known[planned.node.uuid]) for planned in taken if planned.node.uuid in self.known]
+        loose = {uuid for uuid, pin in self.pins.items() if not is_whole(pin.fingerprint)}
         return BulkRows(
-            nodes=[self._node(planned) for planned in taken],
-            whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
+            nodes=[self._node(planned, known) for planned, known in known_nodes],
+            new_nodes=[self._new_node(planned) for planned in taken if planned.node.uuid not in self.known],
+            whitelist=[self._whole_pin(planned) for planned in taken if planned.node.uuid in loose],
+            new_pins=[self._new_pin(planned) for planned in taken if planned.node.uuid not in self.pins],
             keys=[self._key(planned.node) for planned in taken if planned.decision != "same"],
             holders=[
                 Holder(planned.node.uuid, other, self.now, self.bundle.mode)
@@ -119,34 +132,34 @@ class ImportedRows:
             created=self.now,
         )
 
-    def _entry(self, planned: PlannedNode) -> WhitelistEntry | None:
-        """Return the whitelist entry, pinned to the node's key; None if the node is pinned already."""
+    def _new_pin(self, planned: PlannedNode) -> NewPin:
+        """Return the whitelist entry of a node that has none, pinned to its key."""
         node = planned.node
-        pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
-        if pin is None:
-            return WhitelistEntry(node.uuid, digits, self.now, "import", planned.name)
-        return None if is_whole(pin.fingerprint) else replace(pin, fingerprint=digits, assurance="import")
+        return NewPin(node.uuid, fingerprint(node.node_key), self.now, "import", planned.name)
 
-    def _node(self, planned: PlannedNode) -> NodeRecord:
-        """Return the node's new record, without epoch and sequence, which only a session can report."""
+    def _whole_pin(self, planned: PlannedNode) -> WhitelistEntry:
+        """Return the entry of a node that was listed without its whole fingerprint, pinned to its key."""
         node = planned.node
-        state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
-        known = self.known.get(node.uuid)
-        if known is None:
-            return NodeRecord(
-                node.uuid,
-                node.node_key,
-                planned.name,
-                node.profile,
-                state,
-                teds_sha256=node.teds_sha256,
-            )
+        return replace(self.pins[node.uuid], fingerprint=fingerprint(node.node_key), assurance="import")
+
+    @staticmethod
+    def _state(node: BundledNode) -> NodeState:
+        return NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED
+
+    def _new_node(self, planned: PlannedNode) -> NewNode:
+        """Return a node's first record, without epoch and sequence, which only a session can report."""
+        node = planned.node
+        return NewNode(node.uuid, node.node_key, planned.name, node.profile, int(self._state(node)), node.teds_sha256)
+
+    def _node(self, planned: PlannedNode, known: NodeRecord) -> NodeRecord:
+        """Return the record of a node that is known here with what the bundle adds; epoch and sequence stay."""
+        node = planned.node
         return replace(
             known,
             point=node.node_key,
             name=known.name or planned.name,
             profile=known.profile or node.profile,
-            state=known.state or state,
+            state=known.state or int(self._state(node)),
             teds_sha256=known.teds_sha256 or node.teds_sha256,
         )
 
@@ -154,6 +167,7 @@ class ImportedRows:
         """Return key flags by UUID: rotations due after a move, and the CA that a node keeps, or will once proven."""
         ca, own = self.bundle.ca, self.station.ca
         marks: dict[bytes, dict[str, Any]] = {}
+        kept_ca: dict[str, Any] = {"ca": ca}
         for planned in taken:
             uuid = planned.node.uuid
             if uuid in self.resting:
@@ -165,8 +179,8 @@ class ImportedRows:
             if planned.decision == "newer":  # keep the present key and its CA until a session proves the new one
                 kept: dict[str, Any] = {"next_key_id": planned.node.kid, "next_ca": ca}
             else:
-                kept = {"ca": ca}
-            marks[uuid] = {**marks.get(uuid, {}), **kept}
+                kept = kept_ca
+            marks[uuid] = marks[uuid] | kept if uuid in marks else kept
         return marks
 
 

@@ -11,7 +11,15 @@ from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
 from teds_provision.station.policy import Policy
-from teds_provision.station.store.records import Holder, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
+from teds_provision.station.store.records import (
+    Holder,
+    KeyRecord,
+    NewNode,
+    NewPin,
+    NodeRecord,
+    Tombstone,
+    WhitelistEntry,
+)
 from teds_provision.station.store.store import Store
 
 
@@ -20,7 +28,9 @@ class BulkRows:
     """Rows to add or replace, and flags of keys; the caller has held epochs and keys against what is there."""
 
     nodes: Sequence[NodeRecord] = ()
+    new_nodes: Sequence[NewNode] = ()
     whitelist: Sequence[WhitelistEntry] = ()
+    new_pins: Sequence[NewPin] = ()
     keys: Sequence[KeyRecord] = ()
     holders: Sequence[Holder] = ()
     tombstones: Sequence[Tombstone] = ()
@@ -41,7 +51,9 @@ class Bulk:
         """Add or replace all rows, or none; MACs are made as they are written. Raises StoreError."""
         with self._store.transaction():
             self._nodes.put_many(rows.nodes)
+            self._nodes.add_many(rows.new_nodes)
             self._pins.put_many(rows.whitelist)
+            self._pins.add_many(rows.new_pins)
             self._keys.add(*rows.keys)
             self._keys.put_holder(*rows.holders)
             self._policy.put_tombstone(*rows.tombstones)

@@ -20,7 +20,7 @@ from teds_provision.errors import (
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
-from teds_provision.station.store.database import chunks, places
+from teds_provision.station.store.database import chunks
 from teds_provision.station.store.records import Holder, KeyFlags, KeyRecord, KeySource, utc_now
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
@@ -32,8 +32,9 @@ MAX_PENDING = 8
 _NO_FLAGS: Final = KeyFlags()
 _COLUMNS: Final = "seq, uuid, epoch, key_id, state, slot, wrapped, source, created"
 _COLUMNS_IN_ORDER: Final = ", ".join(column.name for column in fields(KeyRecord))
-_FLAGS: Final = ", ".join(column.name for column in fields(KeyFlags))
-_flag_values = attrgetter(*(column.name for column in fields(KeyFlags)))
+_FLAG_COLUMNS: Final = ("uuid", *(column.name for column in fields(KeyFlags)))
+_FLAGS: Final = ", ".join(_FLAG_COLUMNS[1:])
+_flag_values = attrgetter(*_FLAG_COLUMNS[1:])
 _key_values, _holder_values = (attrgetter(*(column.name for column in fields(kind))) for kind in (KeyRecord, Holder))
 _ADD_KEY: Final = (
     "INSERT INTO keys(uuid, epoch, key_id, state, slot, wrapped, source, created) VALUES(?,?,?,?,?,?,?,?)"
@@ -394,7 +395,7 @@ class NodeKeys:
             after = (
                 KeyFlags(**values) if before is _NO_FLAGS else replace(before, **values)
             )  # replace() takes four times as long
-            if after != before:
+            if after.ca != before.ca or after != before:  # the former is quicker, and decides in a handover
                 wanted[uuid] = after
         if wanted:
             self.put_flags(wanted)
@@ -419,14 +420,12 @@ class NodeKeys:
 
         A node without any flag has no row.
         """
-        columns = ("uuid", *fields(KeyFlags))
-        without = [(uuid,) for uuid, kept in flags.items() if kept == _NO_FLAGS]
+        without = [(uuid,) for uuid, kept in flags.items() if kept.ca is None and kept == _NO_FLAGS]
         gone = {uuid for (uuid,) in without}
         rows = ((uuid, *_flag_values(kept)) for uuid, kept in flags.items() if uuid not in gone)
         with self._store.together():
             self._store.execute_many("DELETE FROM marks WHERE uuid = ?", without)
-            statement = f"INSERT OR REPLACE INTO marks(uuid, {_FLAGS}) VALUES({places(columns)})"
-            self._store.execute_many(statement, rows)
+            self._store.replace_rows("marks", _FLAG_COLUMNS, rows)
 
     def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
         """Yield the CAs of nodes that keep another one than the owner's, for a check of their MACs."""

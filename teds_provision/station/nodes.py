@@ -17,7 +17,7 @@ from teds_provision.lazy import late
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
 from teds_provision.station.store.database import CHUNK, chunks, places
-from teds_provision.station.store.records import UUID_OCTETS, ExportedNode, ExportEligibility, NodeRecord
+from teds_provision.station.store.records import UUID_OCTETS, ExportedNode, ExportEligibility, NewNode, NodeRecord
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
@@ -40,6 +40,10 @@ _EXPORTED_COLUMNS = ", ".join(
     for name in ExportedNode._fields
 )
 _REPLACE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({places(NODE_FIELDS)})"
+_ADD = (
+    f"INSERT INTO nodes({', '.join(NewNode._fields)}, point_mac, epoch, sequence, can_address, channels)"
+    f" VALUES({places(NewNode._fields)}, ?, 0, 0, 0, 0)"
+)
 _node_values = attrgetter(*NODE_FIELDS)
 _MAC = NODE_FIELDS.index("point_mac")
 _LISTED_NAMES: Final = (
@@ -95,7 +99,12 @@ class Nodes:
     def put_many(self, records: Iterable[NodeRecord]) -> None:
         """Add or replace nodes, each with a MAC of its identity key; the caller has held them against those here."""
         rows = ((record, self._mac(record.uuid, record.point) if record.point else None) for record in records)
-        self._store.execute_many(_REPLACE, (_row(record, mac) for record, mac in rows))
+        self._store.replace_rows("nodes", NODE_FIELDS, (_row(record, mac) for record, mac in rows))
+
+    def add_many(self, nodes: Iterable[NewNode]) -> None:
+        """Add nodes, each with a MAC of its identity key; the caller knows that none of them is here."""
+        mac = self._mac
+        self._store.execute_many(_ADD, ((*node, mac(node.uuid, node.point)) for node in nodes))
 
     def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
         """Bring what is known of a node up to date and return it."""

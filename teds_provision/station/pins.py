@@ -16,7 +16,7 @@ from teds_provision.station.nodes import Nodes
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
 from teds_provision.station.store.database import CHUNK
-from teds_provision.station.store.records import ExportEligibility, NodeRecord, WhitelistEntry
+from teds_provision.station.store.records import ExportEligibility, NewPin, NodeRecord, WhitelistEntry
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
@@ -182,6 +182,14 @@ class Pins:
         """Add or replace entries, each with its MAC, without a report to the plant; inside a transaction."""
         mac = self._row_macs.mac
         self._put_rows((*_values_but_mac(entry), mac("whitelist", _bound(entry))) for entry in entries)
+
+    def add_many(self, pins: Iterable[NewPin]) -> None:
+        """Add entries as :meth:`put_many` does, of nodes that have none."""
+        mac = self._row_macs.mac
+        self._put_rows(
+            (uuid, fingerprint, added, assurance, name, mac("whitelist", (uuid, fingerprint, assurance, name)))
+            for uuid, fingerprint, added, assurance, name in pins
+        )
 
     def restore(self, entries: Iterable[WhitelistEntry]) -> None:
         """Add or replace entries with the MACs that they have: they come from a backup."""

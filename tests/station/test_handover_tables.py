@@ -7,8 +7,20 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import PolicyError, StoreError, UsageError
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import Handover, Holder, RevocationRecord, Tombstone, TrustRecord
+from teds_provision.station.store.records import (
+    Handover,
+    Holder,
+    NewNode,
+    NewPin,
+    NodeRecord,
+    RevocationRecord,
+    Tombstone,
+    TrustRecord,
+    WhitelistEntry,
+)
 
 NODE = bytes(range(10))
 LAB = TrustRecord("lab", "station", b"\x04" + bytes(64), "ab" * 32)
@@ -103,3 +115,27 @@ def test_a_point_of_the_wrong_length_is_not_trusted(station: Station) -> None:
     with pytest.raises(StoreError):
         station.policy.restore_trust(replace(LAB, point=b"\x04"))
     assert station.policy.trust_rows() == []
+
+
+def test_rows_at_once_replace_whole_rows_with_what_they_leave_empty(station: Station) -> None:
+    """A column that no row of a chunk has a value for is left out of the statement, and is empty afterwards."""
+    named = NodeRecord(NODE, name="left", profile="tactile", retired="worn", epoch=3, due="2027-01-31")
+    other = NodeRecord(bytes(10), name="right", epoch=1)
+    station.bulk.put(BulkRows(nodes=[named, other]))
+    assert station.nodes.all() == [other, named]
+    bare = [NodeRecord(NODE, epoch=4), NodeRecord(bytes(10), epoch=2, charging="{}")]
+    station.bulk.put(BulkRows(nodes=bare))
+    assert station.nodes.all() == bare[::-1]
+
+
+def test_new_rows_at_once_have_macs_and_never_take_the_place_of_others(station: Station) -> None:
+    point = SoftwareKey(5).point
+    node = NewNode(NODE, point, "left", "tactile", 2, "ab" * 32)
+    pin = NewPin(NODE, fingerprint(point), "2026-01-31T12:00:00Z", "import", "left")
+    station.bulk.put(BulkRows(new_nodes=[node], new_pins=[pin]))
+    assert station.nodes.get(NODE) == NodeRecord(NODE, point, "left", "tactile", 2, teds_sha256="ab" * 32)
+    assert station.pins.entry(NODE) == WhitelistEntry(*pin)
+    assert list(station.row_macs.all_broken()) == []
+    with pytest.raises(StoreError):
+        station.bulk.put(BulkRows(new_nodes=[node._replace(uuid=bytes(10)), node._replace(name="right")]))
+    assert [record.name for record in station.nodes.all()] == ["left"]

@@ -231,6 +231,19 @@ class Database(Connection):
                 return [row for row in rows if row[0] in wanted]
         return self.execute(f"{selection} WHERE uuid IN ({places(uuids)}) ORDER BY uuid", uuids)
 
+    def replace_rows(self, table: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+        """Add or replace whole rows, all or none; raises StoreError.
+
+        A column that has no value in any row is left out: it is NULL then, and to bind a NULL costs as much as a value.
+        """
+        with self.together():
+            for chunk in chunks(rows):
+                by_column = list(zip(*chunk, strict=True))
+                used = [number for number, values in enumerate(by_column) if values.count(None) < len(values)]
+                names = [columns[number] for number in used]
+                statement = f"INSERT OR REPLACE INTO {table}({', '.join(names)}) VALUES({places(names)})"
+                self.execute_many(statement, zip(*(by_column[number] for number in used), strict=True))
+
     def stream(self, make: Callable[..., _Record], statement: str, after: int = 0) -> Iterator[_Record]:
         """Make records a chunk at a time, holding no lock between chunks; raises StoreError.
 

@@ -57,6 +57,16 @@ class WhitelistEntry:
     mac: bytes | None = field(default=None, repr=False, compare=False)
 
 
+class NewPin(NamedTuple):
+    """The whitelist entry of a node that has none; as in :class:`WhitelistEntry`."""
+
+    uuid: bytes
+    fingerprint: str
+    added: str
+    assurance: Assurance
+    name: str | None
+
+
 @dataclass(frozen=True, slots=True)
 class NodeRecord:
     """One node as the store knows it.
@@ -84,6 +94,17 @@ class NodeRecord:
     due: str | None = None
     charging: str | None = None
     profile_digest: str | None = None
+
+
+class NewNode(NamedTuple):
+    """What a bundle gives of a node that the store does not know; as in :class:`NodeRecord`."""
+
+    uuid: bytes
+    point: bytes
+    name: str | None
+    profile: str | None
+    state: int
+    teds_sha256: str | None
 
 
 @dataclass(frozen=True, slots=True)
