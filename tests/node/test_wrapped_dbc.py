@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import struct
 import subprocess
 import sys
 import time
 from contextlib import suppress
+from decimal import Decimal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,7 +27,7 @@ from teds_provision.node.sources.base import Reading
 from teds_provision.node.wrapped import dbc_message, latest_values
 from teds_provision.node.wrapped.can_reader import CanReader, MessageReader
 from teds_provision.node.wrapped.dbc_message import DbcMessage, pgn_of
-from teds_provision.node.wrapped.description import WrappedChannel, written_unit
+from teds_provision.node.wrapped.description import WrappedChannel, facts, written_unit
 from teds_provision.node.wrapped.latest_values import LatestValues
 from teds_provision.node.wrapped.reading import describe
 from teds_provision.node.wrapped.running import SensorPlace, WrappedRun, require_match
@@ -283,6 +285,62 @@ def test_a_raw_number_that_float32_cannot_calibrate_travels_as_its_value() -> No
     assert far.sample.model == "float64"
     near = WrappedChannel("x", "V", 0.001, 0.0, bits=16, signed=True)
     assert near.sample == (near.sample.__class__)("unsigned", 3, 16, True, 32768, (-32.768, 0.001))
+
+
+def test_the_profile_of_a_sensor_has_numbers_as_people_write_them(tmp_path: Path) -> None:
+    """A limit that its Float32 in kelvins would exclude is moved, and ended in fourteen digits."""
+    signals = (
+        ' SG_ t : 0|8@1+ (1,-40) [-40|125] "degC" A\n'
+        ' SG_ p : 8|16@1- (0.1,0) [0|0] "count" A\n'
+        ' SG_ q : 24|7@1+ (0.7,0) [0|0] "V" A\n'
+        ' SG_ cold : 32|8@1+ (-0.1,-30) [-55.3|-30] "degC" A'
+    )
+    text = written(tmp_path, signals, 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_ "GenMsgCycleTime" BO_ 100 7;')
+    lines = text.sensor.profile_text("x").splitlines()
+    found = [line for line in lines if line.startswith(("low-limit", "high-limit", "indication", "update-time"))]
+    assert found == [
+        "low-limit = -40.0",
+        "high-limit = 125.00002",
+        "update-time = 0.007",
+        "indication = [1.0, -40.0]",
+        "low-limit = -3276.8",
+        "high-limit = 3276.7002",
+        "update-time = 0.007",
+        "indication = [0.1, -3276.8]",
+        "low-limit = 0.0",
+        "high-limit = 88.9",
+        "update-time = 0.007",
+        "indication = [0.7, 0.0]",
+        "low-limit = -55.30001",
+        "high-limit = -29.99999",
+        "update-time = 0.007",
+        "indication = [-0.1, -30.0]",
+    ]
+    counts = facts(text.sensor.channels[1])
+    assert (counts["low"], counts["high"], counts["period"]) == (-3276.8, 3276.7, 0.007)
+
+
+def test_three_signals_in_turns_have_three_times_the_period_of_the_message(tmp_path: Path) -> None:
+    signals = ' SG_ g M : 0|4@1+ (1,0) [0|15] "" A\n' + "".join(
+        f' SG_ v{turn} m{turn} : 8|16@1+ (1,0) [0|9] "V" A\n' for turn in range(3)
+    )
+    assert [part.period for part in written(tmp_path, signals).sensor.channels] == [0.1, 0.3, 0.3, 0.3]
+
+
+@given(
+    st.decimals("-1e6", "1e6", places=3, allow_nan=False),
+    st.decimals("0.001", "1e6", places=3, allow_nan=False),
+    st.sampled_from(["degC", "degF", "km/h", "rpm", "%", "N·m", "mV"]),
+)
+def test_a_station_takes_the_value_at_the_limit_that_a_file_states(low: Decimal, span: Decimal, unit: str) -> None:
+    channel = WrappedChannel("x", unit, 0.1, is_float=True, bits=64, low=float(low), high=float(low + span))
+    held = [struct.unpack(">f", struct.pack(">f", channel.written.to_si(end)))[0] for end in channel.held_limits]
+    stated = [channel.written.to_si(end) for end in channel.limits]
+    for inside, outside in zip(stated, held, strict=True):
+        assert math.isclose(inside, outside, rel_tol=2e-7, abs_tol=1e-9)
+    assert held[0] <= stated[0] < stated[1] <= held[1]
+    for end in channel.held_limits:
+        assert len(repr(end).strip("-0").partition("e")[0].replace(".", "").strip("0")) <= 11, end
 
 
 def test_a_wrapped_node_is_run_from_its_own_file_only(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from teds_provision.errors import CalibrationMisfitError
 from teds_provision.handover.life import plan_takeover, take_over
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import BuildOrder, build
+from teds_provision.provisioning.calibration_guard import guard
 from teds_provision.provisioning.datasheet_edit import plan_sheet, write_sheet
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
@@ -22,6 +23,7 @@ from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import Channel, ChannelKind
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.guard import misfit
+from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.units import parse_unit
@@ -62,6 +64,18 @@ def test_degrees_are_never_published_as_something_else(
 def test_without_the_calibration_the_new_type_is_built(station: Station, board: Board, calibrated: Path) -> None:
     built = build(station, board.uuid, BuildOrder("load-cell", drop_calibration=True, retype=True))
     assert (1, AccessCode.CALIBRATION) not in built.image.blocks
+
+
+def test_that_the_calibration_is_taken_away_is_said_of_a_datasheet_without_one(
+    station: Station, board: Board, calibrated: Path
+) -> None:
+    had = station.datasheets.datasheet(board.uuid)
+    assert had is not None
+    bare = Image(board.uuid, {place: octets for place, octets in had.blocks.items() if place[1] != 5})
+    away = ("channel 1: the calibration that the node has is taken away",)
+    assert guard(station, bare, had, None, expected=("overdue",)) == away
+    assert guard(station, bare, had, None, expected=("removed",)) == ()
+    assert guard(station, bare, bare, None) == guard(station, bare, None, None) == ()
 
 
 def test_the_same_type_keeps_it(station: Station, board: Board, calibrated: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,11 +27,31 @@ def test_a_keyed_node_on_a_bus_is_listed_by_uuid_and_pinned_by_its_first_tap(
     with talk(board, MemoryLink(board, via="can", tapped=False)) as node:
         entry = add_to_whitelist(station, node, identify(station, node))
     assert (entry.assurance, entry.fingerprint) == ("uuid", None)
+    known = station.nodes.get(board.uuid)
+    assert known is None or known.point is None, "what a stranger could have shown over the bus is no key of the node"
+    (added,) = [line for line in station.audit_log.entries() if line.act == "whitelist"]
+    assert (added.uuid, added.outcome) == (board.uuid, "added")
+    assert added.detail == {"fingerprint": None, "assurance": "uuid"}
     with talk(board) as node:
         shown = identify(station, node)
     pinned = station.pins.entry(board.uuid)
     assert pinned is not None
     assert pinned.fingerprint == shown.fingerprint
+
+
+def test_a_new_node_on_a_bus_and_any_node_that_is_tapped_are_pinned_with_their_key(station: Station) -> None:
+    for number, (via, tapped, assurance) in enumerate([("can", False, "bus"), ("nfc", True, "tap")]):
+        new = Board(bytes([number]) * 10)
+        with talk(new, MemoryLink(new, via=via, tapped=tapped)) as node:
+            entry = add_to_whitelist(station, node, who := identify(station, node))
+            assert add_to_whitelist(station, node, who) == entry
+        known = station.nodes.get(new.uuid)
+        assert known is not None
+        assert (entry.assurance, entry.fingerprint, known.point) == (assurance, who.fingerprint, new.key.point)
+    assert [line.outcome for line in station.audit_log.entries() if line.act == "whitelist"] == ["added", "added"]
+    station.pins.put(replace(entry, name="first"))
+    with talk(new) as node:
+        assert add_to_whitelist(station, node, who).name == "first", "an entry that is there already stays"
 
 
 def test_an_open_session_shows_that_a_board_whose_pin_was_taken_off_was_not_replaced(

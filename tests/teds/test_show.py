@@ -1,5 +1,6 @@
 """Putting TEDS into words: units, dates, UUIDs, and never an exception, whatever the octets."""
 
+import hashlib
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats import TedsBlock, read_blocks
-from teds_provision.teds.show import describe, hexadecimal, instant, seconds, shown_to_json, span
+from teds_provision.teds.show import describe, hexadecimal, instant, seconds, shown_to_json, signed_block, span
 
 VECTORS = sorted((Path(__file__).parent.parent / "vectors" / "ieee1451").glob("*.hex"))
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -118,3 +119,144 @@ def test_any_content_of_any_class_never_raises(code, content, edition):
     head = bytes([3, 4, 0, code, 1, 1]) if edition == 2007 else bytes([3, 5, 0, 255, code, 2, 1])
     octets = frame(head + content)
     json.dumps(shown_to_json(describe(TedsBlock(None, code, octets), {(0, code): octets}, now=NOW)), allow_nan=False)
+
+
+def rows_of(shown):
+    pending, out = list(shown.fields), []
+    while pending:
+        field = pending.pop(0)
+        out.append((field.type, field.name, field.text, field.meaning))
+        pending = [*field.children, *pending]
+    return out
+
+
+def test_a_whole_channel_of_temperatures_in_words():
+    kelvin = teds.Units(kelvins=1)
+    fields = [
+        ("CalKey", 4),
+        ("ChanType", 2),
+        ("PhyUnits", kelvin),
+        ("LowLimit", 233.15),
+        ("HiLimit", 373.15),
+        ("OError", 0.5),
+        ("SelfTest", 9),
+        ("Sample", {"DatModel": 1, "ModLenth": 4, "SigBits": 32}),
+        ("DataSet", {"Repeats": 10, "SOrigin": 300.0, "StepSize": 5.0, "SUnits": kelvin, "PreTrigg": 0}),
+        ("UpdateT", 1e-4),
+        ("SPeriod", float("nan")),
+        ("WarmUpT", 172_800.0),
+        ("RDelayT", 172_799.0),
+        ("Sampling", {"SampMode": 0b10011, "SDefault": 2}),
+        ("DataXmit", 200),
+    ]
+    shown = shown_of(3, fields)
+    assert rows_of(shown) == [
+        (3, "TEDSID", "00 03 01 01", ""),
+        (10, "CalKey", "4", "TIM_CAL_SUPPLIED"),
+        (11, "ChanType", "2", "event sensor"),
+        (12, "PhyUnits", "K", ""),
+        (13, "LowLimit", "-40 °C", ""),
+        (14, "HiLimit", "100 °C", ""),
+        (15, "OError", "0.5 °C", ""),
+        (16, "SelfTest", "9", "reserved"),
+        (18, "Sample", "", ""),
+        (40, "DatModel", "1", "Float32"),
+        (41, "ModLenth", "4", ""),
+        (42, "SigBits", "32", ""),
+        (19, "DataSet", "", ""),
+        (43, "Repeats", "10", ""),
+        (44, "SOrigin", "26.85 °C", ""),
+        (45, "StepSize", "5 °C", ""),
+        (46, "SUnits", "K", ""),
+        (47, "PreTrigg", "0", ""),
+        (20, "UpdateT", "100 µs", ""),
+        (23, "SPeriod", "not available", ""),
+        (24, "WarmUpT", "2 days", ""),
+        (25, "RDelayT", "172799 s", ""),
+        (31, "Sampling", "", ""),
+        (48, "SampMode", "19", "trigger, free-running, immediate"),
+        (49, "SDefault", "2", ""),
+        (32, "DataXmit", "200", "manufacturer's own"),
+    ]
+    assert shown.summary == (("range", "-40 °C to 100 °C, uncertainty 0.5 °C"),)
+    without = shown_of(3, [(name, float("nan") if name == "OError" else value) for name, value in fields])
+    assert without.summary == (("range", "-40 °C to 100 °C"),)
+    tree = shown_to_json(shown)
+    assert [(part["type"], part["offset"]) for part in tree["fields"][8]["fields"]] == [
+        (43, 59),
+        (44, 63),
+        (45, 69),
+        (46, 75),
+        (47, 83),
+    ]
+    assert tree["fields"][1] == {
+        "type": 11,
+        "name": "ChanType",
+        "kind": "integer",
+        "value": 2,
+        "offset": 13,
+        "text": "2",
+        "meaning": "event sensor",
+    }
+    assert (tree["edition"], tree["verdict"], tree["summary"]) == (
+        2007,
+        "content-nonconformant",
+        [{"label": "range", "text": "-40 °C to 100 °C, uncertainty 0.5 °C"}],
+    )
+
+
+def test_a_calibration_that_is_due_is_overdue_from_its_day_and_has_each_input_in_words():
+    def calibration(segments):
+        return [
+            ("LstCalDt", TimeInstance(1_577_836_800)),
+            ("CalInrvl", TimeInstance(31_536_000)),
+            ("SIConvrt", {"Slope": 1.0, "Intercept": 0.0}),
+            ("LowLimit", float("nan")),
+            (
+                "CalInput",
+                {
+                    "ChanNum": 1,
+                    "ChanKey": 0,
+                    "Degree": 1,
+                    "Boundaries": segments,
+                    "Offsets": (0.0,) * (len(segments) - 1),
+                },
+            ),
+            ("Coefs", tuple(float(number) for number in range(2 * (len(segments) - 1)))),
+            ("Method", 0),
+        ]
+
+    for segments, method, coefficients in (
+        ((0.0, 1.0), "linear: 1 segment of degree 1", "0, 1"),
+        (tuple(float(n) for n in range(6)), "linear: 5 segments of degree 1", "0, 1, 2, 3, 4, 5, 6, 7, … (10)"),
+    ):
+        octets = teds.compose(5, calibration(segments))
+        at = datetime(2020, 12, 30, 23, 59, tzinfo=UTC)
+        channel = teds.compose(3, {"PhyUnits": Units(radians=1)})
+        shown = describe(TedsBlock(1, 5, octets), {(1, 3): channel}, now=at)
+        assert shown.summary == (("method", method), ("calibrated", "2020-01-01"), ("due", "2020-12-31"))
+        assert texts(shown)["Coefs"] == coefficients
+        assert texts(shown)["LowLimit"] == "not available"
+        assert texts(shown)["CalInrvl"] == "365 days"
+
+
+def test_octets_and_times_at_the_edges_of_their_words():
+    assert hexadecimal(bytes(24)) == "00" * 24
+    assert hexadecimal(bytes(25)) == "00" * 24 + "… (25 octets)"
+    assert seconds(0.9999995) == "1 s"
+    assert seconds(-0.002) == "-2 ms"
+    assert seconds(172_800.0) == "2 days"
+    assert span(TimeInstance(1, 500_000_000)) == "1.5 s"
+    assert span(TimeInstance(86_400, 0, True)) == "-86400 s"
+    assert instant(TimeInstance(0, 5)) == "1970-01-01 00:00:00 UTC"
+    assert instant(TimeInstance(2**47, 0, True)) == "-140737488355328 s since 1970"
+
+
+def test_a_block_that_a_signature_covers_is_the_same_absent_or_another():
+    name = teds.compose(12, {"Format": 0, "TCName": "a"})
+    raw = b"\0\0\x0c" + hashlib.sha256(name).digest()
+    head = f"channel 0 XdcrName {hashlib.sha256(name).hexdigest()[:16]}…"
+    assert signed_block(raw, {(0, 12): name}) == f"{head} (same)"
+    assert signed_block(raw, {(0, 12): name + b"x"}) == f"{head} (OTHER DIGEST)"
+    assert signed_block(raw, {(0, 1): b"", (1, 12): name}) == f"{head} (absent)"
+    assert signed_block(raw, {(0, 1): b""}) == head, "of one TEDS alone nothing is missing"

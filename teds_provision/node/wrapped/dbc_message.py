@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.files import read_limited
 from teds_provision.lazy import how_to_install
-from teds_provision.node.wrapped.description import DEFAULT_PERIOD, WrappedChannel, WrappedSensor, written_unit
+from teds_provision.node.wrapped.description import DEFAULT_PERIOD, WrappedChannel, WrappedSensor, decimal, written_unit
 from teds_provision.teds.origin import Origin
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def _channel(message: Message, signal: Signal, period: float) -> WrappedChannel:
         signal.is_float,
         low,
         high,
-        (period or DEFAULT_PERIOD) * _turns(message, signal),
+        decimal((period or DEFAULT_PERIOD) * _turns(message, signal)),
         {int(raw): str(text) for raw, text in (signal.choices or {}).items()},
         " ".join((signal.comment or "").split()),
         "; ".join(notes),

@@ -34,6 +34,8 @@ _MOST_BITS: Final = 64
 _LARGEST: Final = 1e30
 """Limit of a float that states none: its limits in SI units still fit a Float32."""
 _NAME_OCTETS: Final = 120
+_DIGITS: Final = 15
+"""Decimal digits that every double keeps."""
 
 _ALIASES: Final[Mapping[str, str]] = {
     "": "count",
@@ -166,12 +168,15 @@ class WrappedChannel:
             return self.low, self.high
         if self.is_float:
             return -_LARGEST, _LARGEST
-        ends = [raw * self.scale + self.offset for raw in self.raw_ends]
+        ends = [decimal(raw * self.scale + self.offset) for raw in self.raw_ends]
         return min(ends), max(ends)
 
     @property
     def held_limits(self) -> tuple[float, float]:
-        """The limits, moved outward if their Float32 in SI units would exclude the value at the limit itself."""
+        """The limits, moved outward if their Float32 in SI units would exclude the value at the limit itself.
+
+        A moved limit has the fewest digits that give that Float32: 120.00002 for 120 °C.
+        """
         low, high = self.limits
         return self._outward(low, -math.inf), self._outward(high, math.inf)
 
@@ -184,7 +189,9 @@ class WrappedChannel:
         octets = struct.unpack(">i", struct.pack(">f", held))[0]
         larger = (held > 0) == (outward > 0)  # the next Float32 away from zero or towards it
         (next_one,) = struct.unpack(">f", struct.pack(">i", octets + (1 if larger else -1)))
-        return float((next_one - unit.offset) / unit.scale)
+        moved = (next_one - unit.offset) / unit.scale
+        rounded = (float(f"{moved:.{digits}g}") for digits in range(1, _DIGITS + 1))
+        return next((short for short in rounded if _float32(unit.to_si(short)) == next_one), float(moved))
 
     @property
     def unstated(self) -> tuple[str, ...]:
@@ -399,4 +406,9 @@ def _toml(text: str) -> str:
 
 
 def _number(value: float) -> str:
-    return repr(float(value))
+    return repr(decimal(value))
+
+
+def decimal(value: float) -> float:
+    """Return a number without the last digits of binary arithmetic: 0.3 for 3 × 0.1, as files and people write it."""
+    return float(f"{value:.{_DIGITS}g}")
