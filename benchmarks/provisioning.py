@@ -10,6 +10,9 @@ its P-256 and its flash took; what else is its own, from the arrival of what it 
 stands in a line below, and ``--exchanges`` shows where the station's part lies. The ratio is the whole, find included,
 to link + wait + node, median of what it was for each node; the one *before* is to the octets of the exchanges after the
 finding and the point operations alone, as it was reckoned until 2026-11-21.
+
+``--alone``: the store is in memory, this process has the first core to itself and the nodes have the others. What is
+left above the ratio's floor is then the station's own: one interpreter, on one core.
 """
 
 from __future__ import annotations
@@ -204,8 +207,18 @@ LINES = (
     Line("node in C: CAN 500 kbit/s, named", "can", (), limits.CLASSIC, "&pace=1", aim=1.08, named=True, in_c=True),
     Line("node in C: CAN FD 500k/2M, named", "can", (), limits.FD, "&pace=1&fd=1", aim=1.20, named=True, in_c=True),
 )
+MEMORY = Path("/dev/shm")
 OWN_SHARE = 0.05
 """Aim: what a node in C takes beside its P-256 and its flash, of the time of the link."""
+
+
+_ALL_CORES = os.sched_getaffinity(0)
+
+
+def _cores_of_nodes() -> set[int]:
+    """Return the cores that the station leaves to the nodes: all of them, unless it has one to itself."""
+    own = os.sched_getaffinity(0)
+    return _ALL_CORES - own or own
 
 
 @contextmanager
@@ -217,6 +230,7 @@ def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
         stdout=subprocess.PIPE,
         text=True,
     )
+    os.sched_setaffinity(process.pid, _cores_of_nodes())
     try:
         yield process
     finally:
@@ -367,9 +381,16 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=11, help="nodes a row")
     parser.add_argument("--only", default="", help="rows whose title holds this word")
     parser.add_argument("--exchanges", action="store_true", help="show each exchange of each row")
+    parser.add_argument("--alone", action="store_true", help="store in memory, the station alone on one core")
     options = parser.parse_args(words)
+    if options.alone:
+        if len(_ALL_CORES) < 2:
+            raise SystemExit("--alone needs two cores.")
+        os.environ["BENCH_DISK"] = str(MEMORY)
     has_c = subprocess.run(["make", "-C", "firmware", "host"], capture_output=True, check=False).returncode == 0
     secret = secrets.token_hex(8)
+    if options.alone:
+        os.sched_setaffinity(0, {min(_ALL_CORES)})
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_DISK")) as folder:
         station, _ = initialise(
             Path(folder) / "home", name="bench", keystore="file", ask=lambda p, c: secret, costs=THROWAWAY
