@@ -76,7 +76,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "registry disconnect": frozenset({"yes", "dry-run"}),
     "registry log": frozenset({"station", "since"}),
     "registry remove": frozenset({"retired", "lost", "stolen", "last", "draft", "output", "yes", "dry-run"}),
-    "registry renew": frozenset({"days", "draft", "output", "yes", "dry-run"}),
+    "registry renew": frozenset({"days", "redate", "draft", "output", "yes", "dry-run"}),
     "registry request": frozenset({"output"}),
     "registry resume": frozenset({"files", "yes", "dry-run"}),
     "registry role": frozenset({"signed", "draft", "output", "yes", "dry-run"}),

@@ -91,7 +91,10 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
         # the roster's date shows if this machine's clock was set back
         at = now() if own is None else max(now(), own.created)
         if how not in ("same", "older") and roster.created > at + MOST_AHEAD:
-            how, why = "refused", "it is dated in the future: check this machine's clock"
+            how, why = (
+                "refused",
+                "it is dated in the future: check this machine's clock and its owner's (registry renew --redate)",
+            )
         if how in ("same", "older") and (how == "same" or roster.hash in known):
             continue
         results.append((roster, how, why))

@@ -26,14 +26,19 @@ FILES = "file:"
 
 
 def request(station: Station) -> bytes:
-    """Give this station's request to be a member, signed; the same again while name and certificate are the same."""
+    """Give this station's request to be a member, signed; the same again while name and certificate are the same.
+
+    One that a wrong clock dated too far ahead is made anew, with the same login: nobody takes it before its time.
+    """
     kept = station.plant.login()
     secret = os.urandom(scram.SECRET_OCTETS) if kept is None else kept[0]
     made = MemberRequest(
         station.name, station.point, station.identity.signature, scram.verifier(secret), now().replace(microsecond=0)
     )
-    if kept is not None and replace(open_request(kept[1]), created=made.created) == made:
-        return kept[1]
+    if kept is not None:
+        earlier = open_request(kept[1])
+        if earlier.created <= made.created + MOST_AHEAD and replace(earlier, created=made.created) == made:
+            return kept[1]
     octets = made.signed(station.vault.identity())
     with station.transaction():
         station.plant.keep_login(secret, octets)
@@ -74,7 +79,8 @@ def found_roster(station: Station, transport: Transport, octets: bytes | None) -
     if best is not held and best.created > now() + MOST_AHEAD:
         raise PolicyError(
             f"The roster of {best.name} is dated {best.created:%Y-%m-%d}, in the future.",
-            hint="Set the clock of this machine, or have the owner set his and sign the next version: registry renew",
+            hint="Set the clock of this machine, or have the owner set his and sign the next version: registry renew"
+            " --redate",
         )
     if best.expires <= now():
         raise RosterExpiredError(

@@ -212,9 +212,20 @@ def unshared(station: Station, what: tuple[str, str]) -> Roster:
     return following(station, share=tuple(share for share in own.share if share.what != what))
 
 
-def renewed(station: Station, days: timedelta) -> Roster:
-    """Draft the same roster with a new end."""
-    return following(station, expires=max(_to_the_second(now()), require_roster(station).created) + days)
+def renewed(station: Station, days: timedelta, *, redate: bool = False) -> Roster:
+    """Draft the same roster with a new end.
+
+    ``redate``: dated by this clock alone, by a person's word, since a wrong clock dated the present one too far ahead.
+    """
+    moment = _to_the_second(now())
+    if redate:
+        return replace(following(station, expires=moment + days), created=moment)
+    return following(station, expires=max(moment, require_roster(station).created) + days)
+
+
+def is_ahead(held: Roster) -> bool:
+    """Return True if other stations do not take this roster yet, by this machine's clock: it is dated in the future."""
+    return held.created > now() + MOST_AHEAD
 
 
 def require_member(roster: Roster, name: str) -> Member:
@@ -227,9 +238,12 @@ def require_member(roster: Roster, name: str) -> Member:
 
 
 def says_the_same(before: Roster | None, after: Roster) -> bool:
-    """Return True if a version would change nothing: members, removed ones, shares, end date."""
-    return before is not None and all(
-        getattr(before, what) == getattr(after, what) for what in ("members", "removed", "share", "expires")
+    """Return True if a version would change nothing: members, removed ones, shares, end date, an earlier date."""
+    same = ("members", "removed", "share", "expires")
+    return (
+        before is not None
+        and after.created >= before.created
+        and all(getattr(before, what) == getattr(after, what) for what in same)
     )
 
 
@@ -251,6 +265,8 @@ def read_draft(octets: bytes, ca: bytes) -> Roster:
 def changes(before: Roster | None, after: Roster) -> list[str]:
     """Return the changes of a new version, in sentences; every key with all 64 digits."""
     lines = [f"roster {after.version} of {after.name} ({after.registry}), until {after.expires:%Y-%m-%d}"]
+    if before is not None and after.created < before.created:
+        lines.append(f"  dates it {after.created:%Y-%m-%d}; the one before was dated {before.created:%Y-%m-%d}")
     there = before.by_key if before is not None else {}
     for member in after.members:
         old = there.get(member.fingerprint)

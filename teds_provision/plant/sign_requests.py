@@ -29,7 +29,7 @@ from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
 from teds_provision.plant import connecting, parcels, postgres
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.plant.jobs import find_job, roster_of
+from teds_provision.plant.jobs import find_job, now_of, roster_of
 from teds_provision.plant.transport import SMALL, Parcel, Transport
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.datasheet import SignedNodeKey
@@ -40,7 +40,7 @@ from teds_provision.protocol.keys import fingerprint, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.document import SIGNED, DocumentKind, hash_of
 from teds_provision.protocol.plant.job import Job
-from teds_provision.protocol.plant.roster import Roster
+from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster
 from teds_provision.protocol.plant.signing import (
     NONCE_OCTETS,
     Answer,
@@ -414,13 +414,17 @@ def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, re
 def _earlier(station: Station, wanted: SignatureOrder) -> SignRequestRow | None:
     """Return the newest request for exactly this epoch, name and content if it still holds, else None.
 
-    The newest is that of the highest sequence: a clock that was set back does not bring an older one to the front.
+    The newest is that of the highest sequence: a clock that was set back does not bring an older one to the front. One
+    without an answer that a wrong clock dated too far ahead does not hold: no office takes it before its time.
     """
     found: tuple[int, bool, SignRequestRow] | None = None
+    latest = now_of(roster_of(station)) + MOST_AHEAD
     for row in station.plant.line.sign_requests(wanted.job, wanted.image.uuid, "out"):
         if row.peer != wanted.office:
             continue
         request = open_request(row.request, lambda kid: station.point)
+        if row.answer is None and request.created > latest:
+            continue
         same = (request.epoch, request.name, request.calibration) == (wanted.epoch, wanted.name, wanted.calibration)
         if same and request.image.unsigned_blocks() == wanted.image.unsigned_blocks():
             place = (request.sequence, row.answer is not None)

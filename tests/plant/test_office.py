@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NotAuthenticError, PolicyError
-from teds_provision.plant import jobs, office, parcels
+from teds_provision.plant import jobs, office, parcels, sign_requests
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
@@ -496,6 +496,27 @@ def test_a_request_from_the_future_waits(desk: Desk) -> None:
     late = replace(request, created=NOW + timedelta(hours=25))
     with pytest.raises(RequestAheadError, match=r"dated this request 20\d\d-.*, and it is 20"):
         answer(desk.office, seal_request(late, desk.line.credentials().key))
+
+
+def test_a_request_of_a_wrong_clock_is_made_anew_when_the_clock_is_right(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same request was repeated until its date had come: no command of the line made that board authentic."""
+
+    class Ahead(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+            return datetime.now(tz) + timedelta(days=3)
+
+    run, board = desk.run(), make_board(1)
+    with monkeypatch.context() as wrong:
+        wrong.setattr(sign_requests, "datetime", Ahead)
+        early = desk.request(run, board)
+    with pytest.raises(RequestAheadError):
+        answer(desk.office, early.octets)
+    assert build(run, board).verified.verdict == "authentic"
+    assert run.job is not None
+    assert desk.office.plant.line.count_units(run.job.id)[0] == 1
 
 
 def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(

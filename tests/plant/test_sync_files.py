@@ -19,12 +19,12 @@ from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import resume, sync
 from teds_provision.plant.transport import CarriedPage, Parcel
 from teds_provision.protocol.handover.revocation import seal_revocation
-from teds_provision.protocol.plant.document import hash_of
+from teds_provision.protocol.plant.document import hash_of, open_request
 from teds_provision.protocol.plant.event import hash_of_statement
 from teds_provision.protocol.plant.page import PageDraft, sign_page
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
-from tests.plant.stations import Plant, ask
+from tests.plant.stations import Plant, ask, certified
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 KEY = "ab" * 32
@@ -341,6 +341,47 @@ def test_a_clock_a_year_ahead_makes_no_roster_that_counts(plants: Plant) -> None
     assert any("check this machine's clock" in line for line in done.remarks)
     assert south.plant.roster is not None
     assert south.plant.roster.version == version
+
+
+def test_a_roster_of_an_owners_wrong_clock_is_dated_anew_by_his_word(
+    plants: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every version after it kept the wrong date: for a year no station took a roster, not even one that removes."""
+    south = plants.member("south", "base")
+    plants.round()
+    with monkeypatch.context() as wrong:
+        wrong.setattr(plant.owner, "now", lambda: datetime.now(UTC) + timedelta(days=365))
+        plants.change(plant.owner.renewed(plants.north, timedelta(days=90)))
+    held = plants.north.plant.roster
+    assert held is not None
+    assert plant.owner.is_ahead(held)
+    plants.change(plant.owner.renewed(plants.north, timedelta(days=90)))
+    plants.round()
+    assert (south.plant.roster.version if south.plant.roster else 0) < held.version
+    again = plant.owner.renewed(plants.north, timedelta(days=90), redate=True)
+    assert not plant.owner.says_the_same(plants.north.plant.roster, again)
+    assert any("dates it" in line for line in plant.owner.changes(plants.north.plant.roster, again))
+    plants.change(again)
+    plants.round()
+    assert south.plant.roster == plants.north.plant.roster
+    later = plant.owner.following(plants.north)
+    assert not plant.owner.is_ahead(later)
+
+
+def test_a_request_to_join_of_a_wrong_clock_is_made_anew_with_the_same_login(
+    plants: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stayed dated in the future, whatever was done about the clock, and no owner took it."""
+    south = certified(plants.folder / "late", "late", plants.north)
+    with monkeypatch.context() as wrong:
+        wrong.setattr(plant.membership, "now", lambda: datetime.now(UTC) + timedelta(days=3))
+        early = plant.membership.request(south)
+        assert plant.membership.request(south) == early
+    made = plant.membership.request(south)
+    assert made != early
+    assert open_request(made).login == open_request(early).login
+    assert plant.owner.add(plants.north, open_request(made), frozenset({"base"})).named("late") is not None
+    south.close()
 
 
 def test_a_clock_that_was_put_back_a_year_revives_no_roster(plants: Plant, monkeypatch: pytest.MonkeyPatch) -> None:

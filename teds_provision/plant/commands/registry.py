@@ -80,6 +80,8 @@ def _emit_change(
 ) -> None:
     """Show what a new version changes, ask, sign it, and have it count here; ``file``: only write it as a draft."""
     before = station.plant.roster
+    if plant.owner.is_ahead(draft):
+        _warn_ahead(app, draft)
     if before is not None and plant.owner.says_the_same(before, draft):
         if output is not None and not dry_run:
             _write_once(output, before.octets + b"\n")
@@ -109,6 +111,13 @@ def _emit_change(
     plant.removed_members.review(station, signed, plant.status.moment(signed))
     app.emit(
         _to_json(signed), f"Roster {signed.version} is in force here. To tell the others: teds-provision registry sync"
+    )
+
+
+def _warn_ahead(app: App, ahead: Roster) -> None:
+    app.warn(
+        f"Roster {ahead.version} is dated {local_time(ahead.created.isoformat())}, in the future: other stations do not"
+        " take it. If this machine's clock is right: registry renew --redate"
     )
 
 
@@ -318,12 +327,21 @@ def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
     metavar="DAYS",
     help="Validity from now on.",
 )
+@click.option(
+    "--redate", is_flag=True, help="Date it by this clock, after a wrong clock dated the present one in the future."
+)
 @_change_options
 @pass_app
-def renew(app: App, /, days: int, **how: Any) -> None:
+def renew(app: App, /, days: int, redate: bool, **how: Any) -> None:
     """Extend the roster."""
     station = app.station()
-    _emit_change(app, station, plant.owner.renewed(station, timedelta(days=days)), **_named(how))
+    held = plant.apply_pages.require_roster(station)
+    if redate and not plant.owner.is_ahead(held):
+        raise PolicyError(
+            f"Roster {held.version} is dated {local_time(held.created.isoformat())}, not in the future.",
+            hint="Leave --redate out.",
+        )
+    _emit_change(app, station, plant.owner.renewed(station, timedelta(days=days), redate=redate), **_named(how))
 
 
 def _named(how: dict[str, Any]) -> dict[str, Any]:
@@ -551,6 +569,8 @@ def status(app: App) -> None:
     record = station.plant.joined
     assert record is not None
     found = plant.status.status(station, record, held)
+    if plant.owner.is_ahead(held):
+        _warn_ahead(app, held)
     result = {
         "registry": held.registry,
         "name": held.name,
