@@ -2,8 +2,10 @@
 
 On a busy machine one scheduling accident among ten thousand tests must not refuse a release, but no defect may hide
 behind a retry. So only tests that start processes or use network ports get one, three at most, and only if each failed
-in its own body. Each then runs alone, twice, and must pass both times. Everything else keeps its failure: pure tests,
-more than three, an error of collection, setup or teardown, and a worker that crashed.
+in its own body. Each then runs alone, twice, and must pass both times. The tests of a file for which one shared fixture
+failed (a measurement that all of them look at) count as one, and run together, without others. Everything else keeps
+its failure: pure tests, more than three, an error of collection, of a test's own setup, or teardown, and a worker that
+crashed.
 
 The failures that a second try cleared are printed, and appended to build/second-tries, which ``make test`` prints last.
 
@@ -16,7 +18,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,11 +39,15 @@ PORTS = frozenset({"socket.bind", "socket.connect"})
 
 @dataclass(frozen=True)
 class Failure:
-    """The body of a test that failed: its id, the text of the failure, and why it may be tried again ("" if not)."""
+    """The body of a test that failed: its id, the text of the failure, and why it may be tried again ("" if not).
+
+    ``fixture`` is the shared fixture that failed before the body, "" if the body itself did.
+    """
 
     test: str
     text: str
     because: str
+    fixture: str = ""
 
 
 @dataclass
@@ -64,6 +70,15 @@ class Outcomes:
         return cls(**facts)
 
 
+def accidents(failures: list[Failure]) -> list[list[Failure]]:
+    """Return the failures, those of one file by one shared fixture together."""
+    together: dict[tuple[str, str], list[Failure]] = {}
+    for failure in failures:
+        file = failure.test.partition("::")[0]
+        together.setdefault((file, failure.fixture) if failure.fixture else (failure.test, ""), []).append(failure)
+    return list(together.values())
+
+
 def refusal(code: int, outcomes: Outcomes | None) -> str:
     """Return why no test of a failed run is tried again, or "" if all that failed may be."""
     if outcomes is None or code != pytest.ExitCode.TESTS_FAILED:
@@ -72,7 +87,7 @@ def refusal(code: int, outcomes: Outcomes | None) -> str:
         return f"more than the body of a test failed: {'; '.join(outcomes.errors)}"
     if not outcomes.failures:
         return "no test is recorded as failed"
-    if len(outcomes.failures) > MOST:
+    if len(accidents(outcomes.failures)) > MOST:
         return f"{len(outcomes.failures)} tests failed, more than {MOST}"
     pure = [failure.test for failure in outcomes.failures if not failure.because]
     if pure:
@@ -90,13 +105,15 @@ def main(arguments: list[str]) -> int:
         print(f"\nNo second try: {refused}.", flush=True)
         return code
     profile = [argument for argument in arguments if argument.startswith("--hypothesis-profile=")]
-    for failure in outcomes.failures:
+    found = accidents(outcomes.failures)
+    for failures in found:
+        named = _named(failures)
         for number in range(1, RUNS + 1):
-            print(f"\nSecond try of {failure.test}, alone, run {number} of {RUNS}:", flush=True)
-            if not _passes_alone(failure.test, profile):
-                print(f"\nIt failed alone as well: {failure.test}", flush=True)
+            print(f"\nSecond try of {named}, alone, run {number} of {RUNS}:", flush=True)
+            if not _pass_alone([failure.test for failure in failures], profile):
+                print(f"\nIt failed alone as well: {named}", flush=True)
                 return code
-    note = "".join(map(_note, outcomes.failures))
+    note = "".join(map(_note, found))
     print(f"\n{note}", flush=True)
     NOTES.parent.mkdir(exist_ok=True)
     with NOTES.open("a", encoding="utf-8") as file:
@@ -104,17 +121,26 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _passes_alone(test: str, options: list[str]) -> bool:
-    """Run one test; True if it ran, and passed at once: skipped or repeated by a mark does not count."""
-    code, outcomes = _pytest([*options, test])
-    return code == 0 and outcomes is not None and outcomes.passed == [test] and not outcomes.reruns
+def _pass_alone(tests: list[str], options: list[str]) -> bool:
+    """Run tests; True if all of them ran, and passed at once: skipped or repeated by a mark does not count."""
+    code, outcomes = _pytest([*options, *tests])
+    return code == 0 and outcomes is not None and sorted(outcomes.passed) == sorted(tests) and not outcomes.reruns
 
 
-def _note(failure: Failure) -> str:
+def _named(failures: list[Failure]) -> str:
+    first = failures[0]
+    if not first.fixture:
+        return first.test
+    file = first.test.partition("::")[0]
+    return f"{file}, {len(failures)} tests of the fixture {first.fixture}"
+
+
+def _note(failures: list[Failure]) -> str:
+    first = failures[0]
     return (
-        f"NEEDED A SECOND TRY: {failure.test}\n"
-        f"  It failed beside other tests, and passed {RUNS} times alone ({failure.because}). Find the cause.\n"
-        + "".join(f"  | {line}\n" for line in failure.text.splitlines())
+        f"NEEDED A SECOND TRY: {_named(failures)}\n"
+        f"  It failed beside other tests, and passed {RUNS} times alone ({first.because}). Find the cause.\n"
+        + "".join(f"  | {line}\n" for line in first.text.splitlines())
     )
 
 
@@ -127,7 +153,8 @@ def _pytest(arguments: list[str]) -> tuple[int, Outcomes | None]:
 
 # -- the plugin of pytest ----------------------------------------------------------------------------------------------
 
-_BECAUSE = "because"  # of a report: why its test may be tried again
+# Of a report: why its test may be tried again, and the shared fixture that failed before the test.
+_BECAUSE, _FIXTURE = "because", "fixture"
 
 
 class _Watch:
@@ -137,6 +164,7 @@ class _Watch:
         self.processes = 0
         self.ports = 0
         self.fixtures: dict[object, str] = {}  # those that began with either, wider than a test: which of them
+        self.failed: set[object] = set()  # those wider than a test that failed
         sys.addaudithook(self._heard)
 
     def _heard(self, event: str, arguments: tuple[object, ...]) -> None:
@@ -153,7 +181,12 @@ class _Watch:
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef[object]) -> Generator[None, object, object]:
         before = self.processes, self.ports
-        value = yield
+        try:
+            value = yield
+        except Exception:
+            if fixturedef.scope != "function":
+                self.failed.add(fixturedef)
+            raise
         if found := self.since(*before):
             self.fixtures[fixturedef] = found
         return value
@@ -167,7 +200,11 @@ class _Watch:
         report = yield
         if report.failed:
             setattr(report, _BECAUSE, self._because(item))
+            setattr(report, _FIXTURE, self._failed_fixture(item))
         return report
+
+    def _failed_fixture(self, item: pytest.Item) -> str:
+        return next((name for name, several in _fixtures_of(item).items() if not self.failed.isdisjoint(several)), "")
 
     def _because(self, item: pytest.Item) -> str:
         for mark in MARKS:
@@ -176,10 +213,14 @@ class _Watch:
         for place in PLACES:
             if item.nodeid.startswith(place):
                 return f"below {place}"
-        theirs = getattr(item, "_fixtureinfo", None)
-        used = theirs.name2fixturedefs.values() if theirs else ()
+        used = _fixtures_of(item).values()
         shared = [self.fixtures[fixture] for several in used for fixture in several if fixture in self.fixtures]
         return self.since(*item.stash[_BEFORE]) or (shared[0] if shared else "")
+
+
+def _fixtures_of(item: pytest.Item) -> dict[str, Sequence[object]]:
+    theirs = getattr(item, "_fixtureinfo", None)
+    return theirs.name2fixturedefs if theirs else {}
 
 
 _BEFORE = pytest.StashKey[tuple[int, int]]()
@@ -195,13 +236,18 @@ class _Record:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if str(report.outcome) == "rerun":  # of pytest-rerunfailures
             self.outcomes.reruns += 1
-        elif report.failed and report.when == "call":
-            because = getattr(report, _BECAUSE, "")
-            self.outcomes.failures.append(Failure(report.nodeid, report.longreprtext, because))
-        elif report.failed:  # setup, teardown, or ??? for a worker that crashed
-            self.outcomes.errors.append(f"{report.when} of {report.nodeid}")
+        elif report.failed:
+            self._record_failure(report, getattr(report, _BECAUSE, ""), getattr(report, _FIXTURE, ""))
         elif report.passed and report.when == "call":
             self.outcomes.passed.append(report.nodeid)
+
+    def _record_failure(self, report: pytest.TestReport, because: str, fixture: str) -> None:
+        if report.when == "call":
+            self.outcomes.failures.append(Failure(report.nodeid, report.longreprtext, because))
+        elif report.when == "setup" and fixture:
+            self.outcomes.failures.append(Failure(report.nodeid, report.longreprtext, because, fixture))
+        else:  # a test's own setup, teardown, or ??? for a worker that crashed
+            self.outcomes.errors.append(f"{report.when} of {report.nodeid}")
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         if report.failed:

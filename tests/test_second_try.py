@@ -146,6 +146,38 @@ def test_what_is_no_failed_body_keeps_the_run_red(suite: Suite, body: str, why: 
     assert not suite.note()
 
 
+SHARED = """
+@pytest.fixture(scope='module')
+def seen(): subprocess.run(['true']); fails_once('first')
+@pytest.mark.link
+@pytest.mark.parametrize('number', range(5))
+def test_it(seen, number): pass
+@pytest.mark.link
+def test_other(): pass
+"""
+
+
+def test_the_tests_of_one_failed_fixture_count_as_one_and_run_together(suite: Suite) -> None:
+    suite.run_as_the_gate_does(SHARED, "-p", "xdist", "-n", "1")
+    assert suite.code == 0, suite.printed
+    assert "Second try of test_it.py, 5 tests of the fixture seen, alone, run 2 of 2:" in suite.printed
+    assert "NEEDED A SECOND TRY: test_it.py, 5 tests of the fixture seen" in suite.note()
+    assert suite.note().count("AssertionError: the machine was busy") == 1
+
+
+def test_a_shared_fixture_that_fails_alone_keeps_the_run_red(suite: Suite) -> None:
+    suite.run(SHARED.replace("fails_once('first')", "assert 1 == 2"))
+    assert suite.code == 1
+    assert "It failed alone as well: test_it.py, 5 tests of the fixture seen" in suite.printed
+    assert not suite.note()
+
+
+def test_a_shared_fixture_of_pure_tests_gets_no_second_try(suite: Suite) -> None:
+    suite.run("@pytest.fixture(scope='module')\ndef seen(): fails_once()\ndef test_it(seen): pass")
+    assert suite.code == 1
+    assert "No second try: no other process or network port takes part in test_it.py::test_it." in suite.printed
+
+
 def test_four_failures_are_no_accident(suite: Suite) -> None:
     suite.run(
         "@pytest.mark.link\n@pytest.mark.parametrize('number', range(4))\ndef test_it(number): fails_once(str(number))"
