@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,8 +13,9 @@ import pytest
 from teds_provision.node.hardware.board import ActuatorReading, Battery, Board
 from teds_provision.node.hardware.clock import NodeClock
 from teds_provision.node.node_template import create
+from teds_provision.node.sources.base import Reading
 from teds_provision.node.virtual import VirtualNode
-from teds_provision.protocol.operation.commands import PowerFlag
+from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.tim import Tim
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import list_profiles, load_profile
@@ -110,3 +115,168 @@ def test_what_could_not_be_sent_is_reported_to_the_last_when_all_streams_have_en
         monkeypatch.setattr(Tim, "poll", lambda _tim, wait=wait: wait)
         node.beat()
     assert [line.split()[0] + line[-4:] for line in messages] == ["1(1).", "3(4)."]
+
+
+BATTERY, CHARGING, FULL, IN_FIELD, TOO_LOW = (
+    PowerFlag.BATTERY, PowerFlag.CHARGING, PowerFlag.FULL, PowerFlag.IN_FIELD, PowerFlag.TOO_LOW
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("level", "in_field", "flags", "shown", "volts", "amperes"),
+    [
+        (-3.0, False, BATTERY | TOO_LOW, 0, 3.3, -0.002),
+        (4.99, False, BATTERY | TOO_LOW, 5, 3.34491, -0.002),
+        (5.0, False, BATTERY, 5, 3.345, -0.002),
+        (50.0, True, BATTERY | CHARGING | IN_FIELD, 50, 3.75, 0.05),
+        (99.4, True, BATTERY | CHARGING | IN_FIELD, 99, 4.1946, 0.05),
+        (99.5, True, BATTERY | FULL | IN_FIELD, 100, 4.1955, -0.002),
+        (130.0, False, BATTERY | FULL, 100, 4.2, -0.002),
+    ],
+)
+def test_the_reply_to_power(
+    level: float, in_field: bool, flags: PowerFlag, shown: int, volts: float, amperes: float
+) -> None:
+    battery = Battery(level, host=lambda: 0.0)
+    battery.field(present=in_field)
+    reply = battery.power()
+    assert (reply.flags, reply.level, reply.voltage) == (flags, shown, pytest.approx(volts))
+    assert (reply.current, reply.temperature) == (amperes, 24)
+    assert Board(sheet("gripper")).power() == PowerReply(), "nothing is known without a battery"
+
+
+def test_a_battery_gains_2_per_cent_a_minute_and_loses_a_tenth() -> None:
+    now = [100.0]
+    battery = Battery(50.0, host=lambda: now[0])
+    now[0] += 600
+    battery.field(present=True)  # what passed before counts as outside
+    assert battery.power().level == 49
+    now[0] += 300
+    battery.field(present=False)
+    assert battery.power().level == 59
+    now[0] += 600
+    assert battery.power().level == 58
+
+
+def test_a_simulation_takes_the_clock_over_and_gives_it_back() -> None:
+    host = [5_000]
+    clock = NodeClock(lambda: host[0])
+    host[0] += 40
+    assert (clock.tick(), clock.now(), clock.step, clock.runs_by_itself) == (40, 40e-9, 1000, True)
+    seen: list[tuple[str, int]] = []
+    guarded: list[str] = []
+
+    @contextmanager
+    def guard() -> Iterator[None]:
+        guarded.append("in")
+        yield
+        guarded.append("out")
+
+    clock.due, clock.guard = lambda: seen.append(("due", clock.tick())), guard
+    clock.own_clock()
+    host[0] += 1_000_000
+    assert (clock.tick(), clock.runs_by_itself) == (40, False)
+    clock.advance(0.5, lambda: seen.append(("change", clock.tick())))
+    assert seen == [("due", 499_999_999), ("change", 499_999_999), ("due", 500_000_000)], "samples before it are older"
+    assert guarded == ["in", "out"] * 2
+    assert (clock.tick(), clock.step) == (500_000_000, 499_999_960)
+    clock.own_clock()
+    seen.clear()
+    clock.advance(0.25, lambda: None)
+    assert (clock.tick(), clock.step) == (500_000_000, 499_999_960), "it never goes back"
+    assert seen == [("due", 500_000_000)] * 2
+    clock.advance(10.0, lambda: None)
+    assert (clock.tick(), clock.step) == (10_000_000_000, 0xFFFFFFFF)
+    clock.host_clock()
+    host[0] += 7
+    clock.host_clock()
+    assert (clock.tick(), clock.step, clock.runs_by_itself) == (10_000_000_007, 1000, True)
+
+
+def test_facts_of_the_clock_and_of_channels() -> None:
+    clock = NodeClock(lambda: 0)
+    board = Board(sheet("gripper"), clock=clock)
+    assert (board.step, board.drift, board.lag) == (1000, 50, 0)
+    assert [board.keeps(period) for period in (-1, 0, 1, 3)] == [False, False, True, True]
+    assert board.now() == 0
+    board.sampling = 77
+    assert board.now() == 77
+    clock.own_clock()
+    assert board.drift == 0xFFFF
+    assert {number: facts.actuator for number, facts in board.channels.items()} == {1: True, 2: False, 3: False}
+    assert [place.number for place in board.places] == [2, 3]
+
+
+class Given:
+    """A source with values by channel, which notes what it is asked and told."""
+
+    def __init__(self, **values: float) -> None:
+        self.values = {int(name[1:]): value for name, value in values.items()}
+        self.asked: list[tuple[int, float]] = []
+        self.log: list[object] = []
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        self.asked.append((channel, seconds))
+        value = self.values.get(channel)
+        return None if value is None else Reading(raw=value)
+
+    def start(self, drive: object) -> None:
+        self.log.append(drive)
+
+    def acted(self, values: Mapping[str, float]) -> None:
+        self.log.append(dict(values))
+
+    def stop(self) -> None:
+        self.log.append("stopped")
+
+
+def test_an_event_is_a_change_since_the_last_look() -> None:
+    source = Given(c1=0.0)
+    switch = sheet("limit-switch")
+    board = Board(switch, source=source, clock=NodeClock(lambda: 0))
+    assert board.has_events
+    assert not Board(sheet("gripper")).has_events
+    board.sampling = 2_500_000_000
+    assert list(board.events()) == [], "the first state is no event"
+    assert list(board.events()) == []
+    source.values[1] = 1.0
+    ((channel, tick, reading),) = board.events()
+    assert (channel, tick, reading) == (1, 2_500_000_000, board.read(1, 0))
+    board.faults.add(1)
+    ((_, _, faulty),) = board.events()
+    assert not faulty.valid
+    assert list(board.events()) == []
+    assert source.asked[0] == (1, 2.5)
+
+
+def test_an_actuator_is_shown_and_told_to_the_source() -> None:
+    source, shown = Given(), list[ActuatorReading]()
+    board = Board(sheet("gripper"), source=source, shown=shown.append, clock=NodeClock(lambda: 0))
+    board.start()
+    board.apply({1: b"\x0f\xff"})
+    board.make_safe(1)
+    board.stop()
+    name = shown[0].name
+    assert source.log[0] is board.clock
+    assert source.log[1:] == [
+        {name: pytest.approx(shown[0].value)}, {name: pytest.approx(0.0)}, {name: pytest.approx(0.0)}, "stopped"
+    ]  # fmt: skip
+    assert [(state.channel, state.unit, state.raw, state.safe) for state in shown] == [
+        (1, "m", 4095.0, False), (1, "m", 0.0, True), (1, "m", 0.0, True)
+    ]  # fmt: skip
+    assert board.set_point(1) == b"\0\0"
+
+
+@pytest.mark.parametrize(
+    ("stated", "seconds"),
+    [(math.nan, 0.1), (math.inf, 0.1), (0.0, 0.1), (0.05, 0.1), (3.0, 3.0), (10.0, 10.0), (11.0, 10.0)],
+)
+def test_a_self_test_takes_a_tenth_of_a_second_to_ten(stated: float, seconds: float) -> None:
+    now = [0]
+    own = sheet("gripper")
+    board = Board(replace(own, meta=replace(own.meta, self_test_time=stated)), clock=NodeClock(lambda: now[0]))
+    board.self_test([2, 3])
+    now[0] = round(seconds * 1e9) - 1
+    assert (board.testing(2), board.testing(3), board.testing(1)) == (True, True, False)
+    now[0] += 1
+    assert not board.testing(2)

@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import sys
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,12 +15,14 @@ from typing import BinaryIO, cast
 
 import pytest
 
-from teds_provision.errors import BadDataError, NotFoundError, StoreError, StoreLockedError
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, StoreLockedError, UsageError
 from teds_provision.files import whole_file
 from teds_provision.node import flash_file
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import Delays, VirtualNode
 from teds_provision.protocol.flash import FlashError
+from teds_provision.protocol.keys import verify
+from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import StationSession
@@ -104,6 +107,105 @@ def _die_at(call: int, folder: Path) -> None:
             os._exit(9)
 
     sys.addaudithook(step)
+
+
+def test_the_whole_file_of_a_node(tmp_path: Path) -> None:
+    folder, teds = tmp_path / "a" / "node", {(1, 3): b"abc", (0, 1): b"\x01\x02"}
+    firmware = FirmwareReport("desk/board", (1, 2, 3), 4, bytes(range(32)), FirmwareFlag.LOCATE)
+    made = FlashFile.create(
+        folder, uuid=UUID, name="left", max_message=512, blocks=teds, read_only=frozenset({(1, 3)}), firmware=firmware
+    )
+    key = made.key
+    assert json.loads(made.path.read_text()) == {
+        "format": "teds-virtual-node/3",
+        "name": "left",
+        "max_message": 512,
+        "key": key.secret().hex(),
+        "hardware": [[0, 1, "0102"], [1, 3, "616263"]],
+        "firmware": {
+            "text": "desk/board", "version": "1.2.3", "build": 4, "image": bytes(range(32)).hex(), "flags": ["locate"]
+        },
+        "flash": {
+            "uuid": UUID.hex(),
+            "node_key": key.point.hex(),
+            "node_key_signature": made.load().node_key_signature.hex(),
+            "blocks": [[0, 1, "0102"], [1, 3, "616263"]],
+            "read_only": [[1, 3]],
+            "epoch": 0,
+            "sequence": 0,
+            "key": None,
+            "station": None,
+            "ca": None,
+            "provisioned": False,
+            "can_address": 1 + zlib.crc32(UUID) % 239,
+        },
+    }  # fmt: skip
+    assert verify(key.point, b"TEDS1 node key\0" + UUID + key.point, made.load().node_key_signature)
+    assert (folder.stat().st_mode & 0o777, made.path.stat().st_mode & 0o777) == (0o700, 0o600)
+    later = replace(
+        made.load(), blocks={(0, 1): b"new"}, epoch=3, sequence=4, key=bytes(16), station=key.point, ca=b"\4" * 65,
+        provisioned=True, can_address=9,
+    )  # fmt: skip
+    made.commit(later)
+    again = FlashFile(folder)
+    assert (again.load(), again.hardware) == (later, teds)
+    assert (again.name, again.max_message, again.firmware) == ("left", 512, firmware)
+
+
+def test_a_node_that_is_there_is_opened_and_another_one_is_refused(tmp_path: Path) -> None:
+    teds = {(0, 1): b"\x01"}
+    made = FlashFile.create(tmp_path / "node", uuid=UUID, blocks=teds)
+    for same in ({}, {"uuid": UUID}, {"blocks": teds}, {"uuid": UUID, "blocks": teds}):
+        assert FlashFile.create(tmp_path / "node", **same).key.point == made.key.point
+    for other in ({"uuid": bytes(10)}, {"blocks": {}}, {"uuid": UUID, "blocks": {(0, 1): b"\x02"}}):
+        with pytest.raises(UsageError, match="already holds another node"):
+            FlashFile.create(tmp_path / "node", **other)
+
+
+@pytest.mark.parametrize(("teds", "least"), [(0, 45), (20, 105)])
+def test_a_node_bears_messages_that_list_its_teds(tmp_path: Path, teds: int, least: int) -> None:
+    """List has 42 octets around three for each TEDS, the Security TEDS among them."""
+    blocks = {(channel, 3): b"x" for channel in range(teds)}
+    with pytest.raises(UsageError) as refused:
+        FlashFile.create(tmp_path / "node", blocks=blocks, max_message=least - 1)
+    assert refused.value.hint == f"--max-message {least}"
+    assert not (tmp_path / "node" / "flash.json").exists()
+    assert FlashFile.create(tmp_path / "node", blocks=blocks, max_message=least).max_message == least
+
+
+def test_a_commit_takes_its_delay_and_is_durable_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    FlashFile.create(tmp_path / "node")
+    slept: list[tuple[float, int]] = []
+    slow = FlashFile(tmp_path / "node", delay=0.25)
+    monkeypatch.setattr(
+        "teds_provision.node.flash_file.time.sleep",
+        lambda seconds: slept.append((seconds, FlashFile(tmp_path / "node").load().epoch)),
+    )
+    slow.commit(replace(slow.load(), epoch=5))
+    assert slept == [(0.25, 0)]
+    assert FlashFile(tmp_path / "node").load().epoch == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "reported"),
+    [({"firmware": None}, None), ({}, "virtual/teds-provision"), ({"max_message": 0}, BadDataError),
+     ({"firmware": {"text": "x"}}, BadDataError),
+     ({"firmware": {"text": "x", "version": "1", "build": 1, "image": None, "flags": [1]}}, BadDataError),
+     ({"hardware": [[1]]}, BadDataError), ({"name": ...}, BadDataError)],
+    ids=str,
+)  # fmt: skip
+def test_members_of_a_file_that_may_be_missing_and_those_that_may_not(
+    tmp_path: Path, change: dict[str, object], reported: object
+) -> None:
+    path = FlashFile.create(tmp_path / "node").path
+    document = json.loads(path.read_text()) | change
+    path.write_text(json.dumps({name: value for name, value in document.items() if value is not ...}))
+    if reported is BadDataError:
+        with pytest.raises(BadDataError, match="or it is damaged"):
+            FlashFile(tmp_path / "node")
+        return
+    firmware = FlashFile(tmp_path / "node").firmware
+    assert (None if firmware is None else firmware.text) == reported
 
 
 def test_a_running_node_is_refused_to_another_process(tmp_path: Path) -> None:

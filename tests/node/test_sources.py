@@ -126,6 +126,51 @@ def test_a_bad_file_is_reported_with_its_line(tmp_path: Path, text: str, place: 
         make_source(f"file:{path}", PLACES, print)
 
 
+def test_rows_and_columns_of_a_file_are_read_as_the_page_has_them(tmp_path: Path) -> None:
+    """docs/virtual-nodes.md: a value holds until the next row; the last row for as long as the one before it."""
+    path = tmp_path / "run.csv"
+    path.write_text(
+        "#comment\n\n force , Time ,raw:angle\n 1.5 ,100, 7\n#no row\n2.5,101,inf\n3.5,101,\n,103.5,nan\n4.5,104, -8 \n"
+    )
+    messages: list[str] = []
+    source = make_source(f"file:{path}", PLACES, messages.append)
+
+    def force(*seconds: float) -> list[float | None]:
+        return [None if (reading := source.at(2, at)) is None else reading.value for at in seconds]
+
+    def angle(*seconds: float) -> list[float | None]:
+        return [None if (reading := source.at(1, at)) is None else reading.raw for at in seconds]
+
+    assert force(0.0, 0.99) == [1.5, 1.5]
+    assert force(1.0, 3.49) == [3.5, 3.5], "of two rows of one instant the later counts"
+    assert force(3.5, 3.99, 4.0, 4.5) == [None, None, 4.5, 4.5]
+    assert angle(0.0, 1.0, 3.5, 4.25) == [7, None, None, -8]
+    assert messages == []
+    assert source.at(3, 4.6) is None, "a channel without a column hears of the end too"
+    assert force(4.51, 9.0) + angle(4.51) == [None] * 3
+    assert messages == ["The file of values has ended: from now on all values are invalid."]
+
+
+def test_a_file_of_one_row_is_valid_at_its_instant_alone(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("t,force\n5,1\n")
+    source = make_source(f"file:{path}", PLACES, print)
+    assert source.at(2, 0.0) == Reading(value=1.0)
+    assert source.at(2, 0.001) is None
+
+
+def test_of_a_file_of_values_256_mib_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[int] = []
+
+    def read(_path: Path, most: int, _what: str) -> str:
+        limits.append(most)
+        return "t,force\n0,1\n"
+
+    monkeypatch.setattr("teds_provision.node.sources.recorded.read_text", read)
+    make_source("file:run.csv", PLACES, print)
+    assert limits == [268_435_456]
+
+
 def lines(messages: list[str], *, needs_time: bool = True) -> tuple[LineSource, Clock]:
     source, clock = LineSource(PLACES, messages.append, needs_time=needs_time), Clock()
     source.begin(clock)

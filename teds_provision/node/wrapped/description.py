@@ -311,12 +311,12 @@ class WrappedSensor:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about what was assumed, for people."""
-        return tuple(f"{channel.name}: {channel.note}." for channel in self.channels if channel.note)
+        return tuple(f"{_printable(channel.name)}: {channel.note}." for channel in self.channels if channel.note)
 
     def profile_text(self, name: str) -> str:
         """Return the TOML of a transducer type for this sensor."""
         head = [
-            f"# Transducer type {name}, made from {self.file or self.origin.name} ({self.origin.text}).",
+            f"# Transducer type {name}, made from {_printable(self.file or self.origin.name)} ({self.origin.text}).",
             "# Neither names an uncertainty: each is one step of the raw number. Replace it by that of the data sheet.",
             *(f"# {note}" for note in self.notes),
             "",
@@ -394,10 +394,14 @@ def _text_of(channel: WrappedChannel) -> str:
     return signal_xml(channel.name, channel.comment, {raw: text for raw, text in rows.items() if raw >= 0})
 
 
+def _printable(text: str) -> str:
+    """Return a text without control characters, which no comment of TOML may have."""
+    return "".join(letter if letter.isprintable() else " " for letter in text).strip()
+
+
 def _cut(name: str) -> str:
     """Return a name as a TEDS can hold it: printable, at most 120 octets."""
-    printable = "".join(letter if letter.isprintable() else " " for letter in name).strip()
-    return printable.encode()[:_NAME_OCTETS].decode(errors="ignore")
+    return _printable(name).encode()[:_NAME_OCTETS].decode(errors="ignore")
 
 
 def _toml(text: str) -> str:
