@@ -306,9 +306,11 @@ class _SharedFields:
         listed = ((node.uuid, node.key_id, node.epoch) for node in sorted(nodes, key=attrgetter("uuid")))
         content = content_digest(self.sender, to, mode, self.ca, listed)
         earlier = next((row for row in self.rows if _is_same(row, content, self.now)), None)
-        expires = datetime.fromisoformat(BundleNotes.from_json(earlier.nodes).expires) if earlier else None
-        if expires is None or expires <= self.now:
+        notes = BundleNotes.from_json(earlier.nodes) if earlier else None
+        if notes is None or notes.why_stale(self.now):
             expires = self.now.replace(microsecond=0) + timedelta(days=self.order.days)
+        else:
+            expires = datetime.fromisoformat(notes.expires)
         return ExportPlan(
             earlier.id if earlier else str(uuid4()),
             mode,
@@ -321,7 +323,7 @@ class _SharedFields:
             expires,
             earlier,
             also_held_by,
-            BundleNotes.from_json(earlier.nodes).run if earlier else "",
+            notes.run if notes else "",
         )
 
 
@@ -330,20 +332,21 @@ def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetim
     """Seal the bundle into a new file of mode 0600; the store has it, and a move's keys rest, before it has its name.
 
     Until then the file is a draft without signature and tag, under a temporary name. The same
-    command over its own file finds nothing to do. Raises UsageError (the path holds another file), StoreError,
-    VaultError.
+    command over its own file finds nothing to do. Raises UsageError (the path holds another file, or this bundle as it
+    was sealed before, and no receiver would take it now), StoreError, VaultError.
     """
-    before = _already(plan, output)
+    now = now or datetime.now(UTC)
+    before = _already(plan, output, now)
     if before is not None:
         return ExportResult(plan, before, output.stat().st_size, fresh=False)
     require_new(output)
-    made = _sealing(station, plan, now or datetime.now(UTC))
+    made = _sealing(station, plan, now)
     with new_file(output) as file:
         for piece in made.body():
             file.write(piece)
         end = made.end()
         with station.transaction():
-            _record(station, plan, (made.sha256, made.signed_sha256))
+            _record(station, plan, (made.sha256, made.signed_sha256), now)
         file.write(end)
     return ExportResult(plan, made.sha256, made.octets, fresh=True)
 
@@ -356,6 +359,7 @@ class SealedBundle:
     octets: bytes
     sha256: str
     signed_sha256: str
+    created: datetime
 
 
 @gc_pause.pause_gc()
@@ -363,12 +367,12 @@ def seal_export(station: Station, plan: ExportPlan, now: datetime) -> SealedBund
     """Seal a bundle in memory, for a parcel. Raises StoreError, VaultError, PolicyError (a node changed)."""
     made = _sealing(station, plan, now)
     octets = b"".join([*made.body(), made.end()])
-    return SealedBundle(plan, octets, made.sha256, made.signed_sha256)
+    return SealedBundle(plan, octets, made.sha256, made.signed_sha256, now)
 
 
 def record_export(station: Station, sealed: SealedBundle) -> None:
     """Record the new holders; the caller's transaction also stores the parcel."""
-    _record(station, sealed.plan, (sealed.sha256, sealed.signed_sha256))
+    _record(station, sealed.plan, (sealed.sha256, sealed.signed_sha256), sealed.created)
 
 
 def plan_copies(
@@ -393,8 +397,9 @@ def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[
 
     Raises what :func:`export_bundle` raises; the same command carries on.
     """
+    now = datetime.now(UTC)
     for plan, output in zip(plans, outputs, strict=True):
-        if _already(plan, output) is None:
+        if _already(plan, output, now) is None:
             require_new(output)
     ready = list(plans)
     if len(plans) > 1:
@@ -407,7 +412,7 @@ def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[
 def _announced(station: Station, plan: ExportPlan, run: str) -> ExportPlan:
     """Record a bundle of several that is not sealed yet."""
     named = replace(plan, run=run)
-    return replace(named, earlier=_record(station, named, ()))
+    return replace(named, earlier=_record(station, named, (), None))
 
 
 def outputs_of(output: Path, count: int) -> list[Path]:
@@ -486,13 +491,25 @@ def _is_same(row: Handover, content: str, now: datetime) -> bool:
     return notes.content == content and (row.mode == "move" or datetime.fromisoformat(notes.expires) > now)
 
 
-def _already(plan: ExportPlan, output: Path) -> str | None:
-    """Return the digest of the file if this very handover wrote it before."""
+def _already(plan: ExportPlan, output: Path, now: datetime) -> str | None:
+    """Return the digest of the file if this very handover wrote it before.
+
+    Raises UsageError if no receiver would take that file: it has expired, or a clock that was ahead dated it.
+    """
     if plan.earlier is None or not output.is_file():
         return None
     with output.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return digest if digest in _files_before(plan) else None
+    notes = BundleNotes.from_json(plan.earlier.nodes)
+    if digest not in notes.files:
+        return None
+    why = "was sealed anew since, because it was out of date" if digest in notes.stale else notes.why_stale(now)
+    if why:
+        raise UsageError(
+            f"The bundle in {output} {why}.",
+            hint="Delete the file, or choose another name, and run this again: the bundle is then sealed anew.",
+        )
+    return digest
 
 
 def _sealing(station: Station, plan: ExportPlan, now: datetime) -> EnvelopeWriter:
@@ -538,16 +555,26 @@ def _bundled(station: Station, nodes: Iterable[LeavingNode]) -> Iterator[Bundled
             )
 
 
-def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Handover:
+def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...], created: datetime | None) -> Handover:
     """Write what must be durable before the file: the holders, the bundle's row, and for a move the tombstones.
 
-    ``digests`` are those of the file and of what was signed in it; empty if a bundle of several is announced.
+    ``digests`` are those of the file and of what was signed in it, ``created`` is its date; empty and None if a bundle
+    of several is announced.
     """
-    files = _files_before(plan)
+    files, stale = _files_before(plan), _stale_before(plan, created)
     uuids_hex = tuple(node.uuid.hex() for node in plan.nodes)
     keys = tuple(node.key_id for node in plan.nodes)
     notes = BundleNotes(
-        uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), (*files, *digests), (), keys, plan.run
+        uuids_hex,
+        plan.content,
+        plan.ca.hex(),
+        time_text(plan.expires),
+        (*files, *digests),
+        (),
+        keys,
+        plan.run,
+        time_text(created) if created is not None else "",
+        stale,
     )
     peers = tuple(record.fingerprint for record in plan.receivers)
     row = plan.earlier or Handover(plan.id, "out", plan.mode, peers, OPEN, "")
@@ -570,6 +597,14 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
 def _files_before(plan: ExportPlan) -> tuple[str, ...]:
     """Return the digests of the files that earlier runs of this handover wrote."""
     return BundleNotes.from_json(plan.earlier.nodes).files if plan.earlier else ()
+
+
+def _stale_before(plan: ExportPlan, now: datetime | None) -> tuple[str, ...]:
+    """Return the digests of those that no receiver takes at ``now``, when the bundle is sealed anew."""
+    notes = BundleNotes.from_json(plan.earlier.nodes) if plan.earlier else None
+    if notes is None:
+        return ()
+    return notes.files if now is not None and notes.why_stale(now) else notes.stale
 
 
 def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) -> None:

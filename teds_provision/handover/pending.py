@@ -15,7 +15,7 @@ from operator import attrgetter
 from typing import Any
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError
-from teds_provision.protocol.handover.bundle import Bundle
+from teds_provision.protocol.handover.bundle import CLOCK_TOLERANCE, Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.sanitize import counted
@@ -32,7 +32,8 @@ class BundleNotes:
 
     ``files`` are the SHA-256 of every file that was sealed with this content, and of what was signed in each: sealing
     again gives other octets. ``keys`` are the ids of the keys that left, one for each node (empty in rows of version
-    1); ``run`` is the id of the first bundle made by the same command.
+    1); ``run`` is the id of the first bundle made by the same command. ``created`` and ``expires`` are those of the
+    newest file (``created`` is empty in rows of version 0.2); no receiver takes the files in ``stale`` any more.
     """
 
     uuids: tuple[str, ...]
@@ -43,6 +44,8 @@ class BundleNotes:
     refused: tuple[tuple[str, str], ...] = ()
     keys: tuple[str, ...] = ()
     run: str = ""
+    created: str = ""
+    stale: tuple[str, ...] = ()
 
     def to_json(self) -> str:
         """Return what the store keeps."""
@@ -62,7 +65,17 @@ class BundleNotes:
             refused,
             tuple(members.get("keys", ())),
             members.get("run", ""),
+            members.get("created", ""),
+            tuple(members.get("stale", ())),
         )
+
+    def why_stale(self, now: datetime) -> str:
+        """Return why no receiver would take the newest file at ``now``; "" if it would."""
+        if datetime.fromisoformat(self.expires) <= now:
+            return f"expired at {self.expires}"
+        if self.created and datetime.fromisoformat(self.created) > now + CLOCK_TOLERANCE:
+            return f"is dated {self.created}, in the future"
+        return ""
 
 
 def content_digest(

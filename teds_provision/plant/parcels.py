@@ -21,7 +21,7 @@ from teds_provision.handover import incoming, outgoing, pending
 from teds_provision.plant.folder_transport import LARGEST_PARCEL
 from teds_provision.plant.transport import SMALL, Parcel, Transport
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import CONTENT_TYPE
+from teds_provision.protocol.handover.bundle import CLOCK_TOLERANCE, CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import sharing
@@ -326,7 +326,7 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> s
     """
     peer = plan.receivers[0].fingerprint
     for row in station.plant.parcels.all("out", "ready", "sent"):
-        if row.kind == "bundle" and row.about == plan.id and row.peer == peer and row.expires > time_text(now):
+        if row.kind == "bundle" and row.about == plan.id and row.peer == peer and not _is_over(row, now):
             return row.id
     sealed = outgoing.seal_export(station, plan, now)
     with station.transaction():
@@ -392,7 +392,7 @@ def _expire(station: Station, now: datetime) -> None:
     """Replace what was not receipted in time: a copy by another one, a move under its old id."""
     parcels = station.plant.parcels
     for row in parcels.all("out", "ready", "sent"):
-        if row.expires > time_text(now):
+        if not _is_over(row, now):
             continue
         with station.lock(_COMMAND):
             handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
@@ -406,6 +406,12 @@ def _expire(station: Station, now: datetime) -> None:
                 order = outgoing.ExportOrder((row.peer,), nodes, "move")
                 with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` reports it
                     send_export(station, outgoing.plan_export(station, order, now), now)
+
+
+def _is_over(row: ParcelRow, now: datetime) -> bool:
+    """Return True if no receiver takes an outgoing parcel: expired, or a bundle that a clock dated ahead."""
+    ahead = row.kind == "bundle" and row.created > time_text(now + CLOCK_TOLERANCE)
+    return ahead or row.expires <= time_text(now)
 
 
 def _note_refused(station: Station) -> None:

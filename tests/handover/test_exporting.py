@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
-from teds_provision.handover.incoming import ImportPlan, plan_import
-from teds_provision.handover.outgoing import ExportOrder, _of_the_last_run, plan_export
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, _of_the_last_run, export_bundle, plan_export
 from teds_provision.handover.pending import BundleNotes, close, find_handover, undo
 from teds_provision.protocol.handover.bundle import open_bundle
 from teds_provision.station.plant.plant import PlantRecord
@@ -42,6 +42,26 @@ def test_a_move_that_is_carried_on_after_its_end_gets_a_new_one_and_a_copy_is_an
         later = plan_export(pair.north, order, now=first.expires)
         assert (later.id == first.id) is (mode == "move")
         assert later.expires > now + timedelta(days=13)
+
+
+@pytest.mark.parametrize(("days", "why"), [(8, "expired at 20"), (-3, "is dated 20.*in the future")])
+def test_a_file_that_no_receiver_takes_is_not_called_done(pair: Pair, days: int, why: str) -> None:
+    """Who had to export again, as the receiver's hint asked, was told that there is nothing to do."""
+    path, first = pair.export("move")
+    order, now = ExportOrder(("south",), (pair.board.uuid,), "move"), datetime.now(UTC) + timedelta(days=days)
+    plan = plan_export(pair.north, order, now=now)
+    assert (plan.id, plan.expires) == (first.plan.id, now.replace(microsecond=0) + timedelta(days=7))
+    with pytest.raises(UsageError, match=why):
+        export_bundle(pair.north, plan, path, now)
+    anew = pair.folder / "anew.jwe"
+    assert export_bundle(pair.north, plan, anew, now).fresh
+    plan = plan_export(pair.north, order, now=now)
+    assert not export_bundle(pair.north, plan, anew, now).fresh
+    with pytest.raises(UsageError, match="sealed anew since"):
+        export_bundle(pair.north, plan, path, now)
+    taken = plan_import(pair.south, anew.read_bytes(), now)
+    assert isinstance(taken, ImportPlan)
+    assert close(pair.north, import_bundle(pair.south, taken).receipt).fresh
 
 
 def test_a_bundle_file_is_private_and_never_overwritten(pair: Pair) -> None:

@@ -154,6 +154,20 @@ def test_an_order_that_is_given_again_is_the_same_parcel_until_that_has_expired(
     assert send(now(8)) != first
 
 
+def test_a_copy_that_a_wrong_clock_dated_ahead_is_made_anew_when_the_clock_is_right(plant: Plant) -> None:
+    """Its receiver threw it away; it counted as sent for as long as the clock had been ahead, and a week."""
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    right = now(-3)  # a copy is dated by this machine's clock, three days ahead of this
+    parcels.send_out(plant["west"], plant.transport, plant.views("west"), now())
+    sync(plant, "south", at=right)
+    assert (holds(plant["south"], board.uuid), plant.transport.there) == ([], {})
+    parcels.send_out(plant["west"], plant.transport, plant.views("west"), right)
+    assert len(plant.transport.there) == 1
+    sync(plant, "south")
+    assert holds(plant["south"], board.uuid) == [(1, "import")]
+
+
 def test_a_key_of_one_sender_that_was_never_proven_keeps_no_other_senders_key_out(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "north", "south"))
     board = board_of(plant["west"], os.urandom(10))
