@@ -159,7 +159,10 @@ class Conversation:
         self.identity = contact.identity
         self.uuid = contact.identity.uuid
         self.proven: Identity | None = None
-        """The Identify reply of the open session, None if it was not requested yet."""
+        """The last Identify reply in a session under the key of the open one, None if it was not requested yet.
+
+        :meth:`reopen` keeps it: under one key a node's epoch stays and its sequence only grows, so it stays a bound.
+        """
         self.charging = contact.charging
         """The charge that its initial NFC message reported, also after the conversation moved to another link."""
         self._notice, self._busy_seconds = notice, busy_seconds

@@ -40,7 +40,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.sign import known_node_keys, sign
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import NodeRecord
+from teds_provision.station.store.records import Handover, NodeRecord
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session, trust
 
@@ -331,6 +331,21 @@ def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, we
     assert [plan_removal(pair.south, station).cas for station in (north, other)] == [(), ()]
     assert remove(pair.south, north).cas == ()
     assert remove(pair.south, other).cas == (pair.north.ca,)
+
+
+def test_of_the_bundles_for_a_key_that_is_trusted_no_more_those_that_are_open_are_named(
+    pair: Pair, west: Station
+) -> None:
+    (south,) = pair.north.policy.trusted("station")[:1]
+    assert south.name == "south"
+    for id, state, to in (
+        ("1", "open", (pair.south,)), ("2", "closed", (pair.south,)), ("3", "undone", (pair.south,)),
+        ("4", "open", (west,)), ("5", "open", (west, pair.south)),
+    ):  # fmt: skip
+        peers = tuple(station.fingerprint for station in to)
+        pair.north.handovers.put(Handover(id, "out", "copy", peers, state, "{}", created="2026-01-01T00:00:00Z"))
+    assert plan_removal(pair.north, south).open == ("1", "5")
+    assert remove(pair.north, south).open == ("1", "5")
 
 
 # -- L1, L3: receipts ------------------------------------------------------------------------------------------------

@@ -21,6 +21,34 @@ PATTERNS = (
     ),
     # what a draw of changes found that no test noticed (protocol, station, handover, teds)
     Pattern(
+        "of the bundles for a distrusted key the open ones are named",
+        "plan_removal",
+        "row.state == OPEN and digits in row.peers",
+        "digits in row.peers",
+        "tests/handover/test_hostile_stations.py",
+    ),
+    Pattern(
+        "only receivers of a share that forgets are waited for",
+        "forgets",
+        "{receiver for share in shares if share.forget for receiver in receivers(roster, me, share)}",
+        "{receiver for share in shares for receiver in receivers(roster, me, share)}",
+        "tests/plant/test_sharing.py",
+    ),
+    Pattern(
+        "a group that a keeper took a node out of shares it no more",
+        "shares_any",
+        "{*view.own_groups.get(sender, ()), *(group for group, member in view.keeper_groups.items() if member)}",
+        "{*view.own_groups.get(sender, ()), *view.keeper_groups}",
+        "tests/plant/test_sharing.py",
+    ),
+    Pattern(
+        "attempts outside any job are counted by themselves",
+        "Line.last_attempt",
+        "self._store.execute('SELECT coalesce(max(attempt), 0) FROM evidence WHERE uuid = ? AND job IS NULL', (uuid,))",
+        "self._store.execute('SELECT coalesce(max(attempt), 0) FROM evidence WHERE uuid = ?', (uuid,))",
+        "tests/station/test_line_rows.py",
+    ),
+    Pattern(
         "strangers ask About once a second while a stream runs",
         "Permission._plain_security",
         "function in _HELD_BACK",

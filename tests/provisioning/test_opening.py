@@ -63,6 +63,18 @@ def test_what_a_node_said_in_a_session_is_asked_again_in_the_next(board: Board) 
             end()
 
 
+def test_what_a_node_said_bounds_it_in_a_session_under_the_same_key(board: Board) -> None:
+    key = keyed(board)
+    with talk(board) as node:
+        node.open(key)
+        said = read_identity(node)
+        first = node.open_counter
+        node.reopen()
+        assert node.sealed
+        assert node.open_counter != first
+        assert node.proven == said
+
+
 def test_after_the_second_refusal_the_operator_is_told(board: Board) -> None:
     key = keyed(board)
     link = FasterStation(board, key, times=2)
