@@ -175,10 +175,9 @@ def to_csv(station: Station, attempts: Iterable[Attempt]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     attempts = list(attempts)
     steps = list(dict.fromkeys(step for attempt in attempts for step in attempt.steps or {}))
-    writer.writerow([*COLUMNS, *steps])
+    writer.writerow([*COLUMNS, *map(_as_text, steps)])
     for attempt in attempts:
-        name = roster.name_of(attempt.station) if roster is not None else ""
-        name = f"'{name}" if name[:1] in ("=", "+", "-", "@") else name  # a spreadsheet would evaluate it as a formula
+        name = _as_text(roster.name_of(attempt.station) if roster is not None else "")
         seconds = "" if attempt.steps is None else f"{sum(attempt.steps.values()):.3f}"
         verdict = "passed" if attempt.code is None else "failed"
         row = [
@@ -188,8 +187,13 @@ def to_csv(station: Station, attempts: Iterable[Attempt]) -> str:
             attempt.unit or "",
             attempt.attempt,
             verdict,
-            attempt.code or "",
+            _as_text(attempt.code or ""),
             attempt.finished,
         ]
         writer.writerow([*row, seconds, *((attempt.steps or {}).get(step, "") for step in steps)])
     return out.getvalue()
+
+
+def _as_text(text: str) -> str:
+    """Return a text of others as a cell: what a spreadsheet would evaluate as a formula gets an apostrophe."""
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@") else text

@@ -28,6 +28,12 @@ def test_a_stations_name_is_no_formula(name: str, shown: str) -> None:
     assert rows(Attempt("ab" * 32, bytes(10), 1, 1, None, "2026-01-31T12:00:00Z"), name)["name"] == shown
 
 
+def test_nor_is_what_another_station_or_a_document_says_of_an_attempt() -> None:
+    """A code comes from a page, a step's name from a file of evidence."""
+    row = rows(Attempt("ab" * 32, bytes(10), 1, 1, "=1+1", "2026-01-31T12:00:00Z", {"@step": 1.0, "sign": 2.0}), "west")
+    assert (row["code"], row["'@step"], row["sign"]) == ("'=1+1", "1.0", "2.0")
+
+
 def test_seconds_and_verdict_of_an_attempt() -> None:
     passed = rows(Attempt("ab" * 32, bytes(10), 7, 2, None, "2026-01-31T12:00:00Z", {"sign": 0.5, "write": 1.25}), "x")
     assert (passed["seconds"], passed["sign"], passed["verdict"], passed["code"]) == ("1.750", "0.5", "passed", "")

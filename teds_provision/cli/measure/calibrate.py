@@ -303,11 +303,12 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def _fits(console: Console, fitted: Sequence[Calibration], fits: Sequence[dict[str, Any]]) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     for calibration, fit_json in zip(fitted, fits, strict=True):
         unit = calibration.unit.text
-        table = Table("raw", f"value [{unit}]", "fit", "residual", box=None, pad_edge=False)
+        table = Table("raw", escape(f"value [{unit}]"), "fit", "residual", box=None, pad_edge=False)
         for row in fit_json["residuals"]:
             table.add_row(*(f"{row[name]:.6g}" for name in ("raw", "value", "fit")), f"{row['residual']:+.3g}")
         print_table(console, table)

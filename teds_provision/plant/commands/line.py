@@ -254,13 +254,15 @@ def list_jobs(app: App) -> None:
     lines = [_to_json(station, job) for job in found]
 
     def table(console: Console) -> None:
+        from rich.markup import escape
         from rich.table import Table
 
         shown = Table("id", "title", "profile", "boards", "passed here", "until", "state", box=None, pad_edge=False)
         for job, members in zip(found, lines, strict=True):
             until = local_time(job.ends.isoformat())
             counted = f"{members['passed']} of {job.total}"
-            shown.add_row(job.id[:8], job.title, job.profile, str(job.total), counted, until, members["state"])
+            title, profile = escape(job.title), escape(job.profile)
+            shown.add_row(job.id[:8], title, profile, str(job.total), counted, until, members["state"])
         print_table(console, shown)
 
     app.emit(
@@ -381,14 +383,14 @@ def _table(console: Console, found: jobs.Job, parts: list[StationYield], here: s
         failures = ", ".join(f"{count} {code}" for code, count in part.failures.most_common())
         over = " [bold red]over[/]" if part.over else ""
         units = f"{part.units}{over}"
-        table.add_row(escape(part.name), units, str(part.allotment), str(part.passed), first, failures)
+        table.add_row(escape(part.name), units, str(part.allotment), str(part.passed), first, escape(failures))
     print_table(console, table)
     for part in parts:
         if not part.steps:
             continue
         times = Table(f"{escape(part.name)}: step", "median s", "worst s", box=None, pad_edge=False)
         for step, (middle, worst) in part.steps.items():
-            times.add_row(step, f"{middle:.2f}", f"{worst:.2f}")
+            times.add_row(escape(step), f"{middle:.2f}", f"{worst:.2f}")
         print_table(console, times)
     silent = ", ".join(part.name for part in parts if not part.attempts and part.station != here)
     if silent:
