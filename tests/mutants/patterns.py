@@ -19,6 +19,49 @@ PATTERNS = (
         "False",
         "tests/links/can/test_can_many.py",
     ),
+    # what a draw of changes found that no test noticed (links, provisioning, teds)
+    Pattern(
+        "a Bluetooth connection that ended is not held any more",
+        "BleConnection._disconnected",
+        "self._adapter.held.discard(self)",
+        "None",
+        "tests/links/ble/test_connection.py",
+    ),
+    Pattern(
+        "a calibration that is taken away is looked at by the guard",
+        "guard",
+        "is_calibrated(image, has)",
+        "is_calibrated(image)",
+        "tests/provisioning/test_calibration_misfit.py",
+    ),
+    Pattern(
+        "a node that is listed by its UUID alone gives no key",
+        "add_to_whitelist",
+        "entry.fingerprint is not None",
+        "True",
+        "tests/provisioning/test_pinning.py",
+    ),
+    Pattern(
+        "a node goes on at one link at a time",
+        "Conversation.move_to",
+        "self.contact.link.close()",
+        "None",
+        "tests/provisioning/test_conversation.py",
+    ),
+    Pattern(
+        "an order with a deadline is not repeated to a busy node",
+        "Conversation._exchange",
+        "self._patience_with_busy if within is None else 0.0",
+        "self._patience_with_busy",
+        "tests/provisioning/test_conversation.py",
+    ),
+    Pattern(
+        "a field is there twice wherever the first one stands",
+        "_Walk.block",
+        "kind < last or kind in seen",
+        "kind <= last",
+        "tests/teds/test_every_finding.py",
+    ),
     # what a draw of changes found that no test noticed (protocol, station, handover, teds)
     Pattern(
         "of the bundles for a distrusted key the open ones are named",

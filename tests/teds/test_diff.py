@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit
+from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
 from teds_provision.teds.show import seconds
@@ -154,3 +156,132 @@ def test_any_octets_can_be_compared(old: dict[tuple[int, int], bytes], new: dict
 )
 def test_times_are_shown_in_the_unit_people_use(value: float, shown: str) -> None:
     assert seconds(value) == shown
+
+
+RAD, METRE = teds.Units(radians=Fraction(1)), teds.Units(meters=Fraction(1))
+
+
+def name_teds(text: str) -> bytes:
+    return teds.compose(12, {"Format": 0, "TCName": text})
+
+
+def test_each_field_has_the_word_and_the_unit_that_people_use() -> None:
+    def channel(number: int, units: teds.Units, number_of_bits: int) -> bytes:
+        fields = [
+            ("CalKey", number),
+            ("ChanType", 2 * number),
+            ("PhyUnits", units),
+            ("LowLimit", float(number)),
+            ("HiLimit", float(number + 1)),
+            ("OError", 0.01 * (number + 1)),
+            ("SelfTest", number),
+            ("Sample", {"DatModel": 0, "ModLenth": 2, "SigBits": number_of_bits}),
+            ("UpdateT", 0.1 * (number + 1)),
+            ("SPeriod", 0.1 * (number + 1)),
+            ("WarmUpT", 1.0 * (number + 1)),
+        ]
+        return teds.compose(3, fields)
+
+    old = {(3, 3): channel(0, RAD, 12), (3, 12): name_teds("old")}
+    new = {(3, 3): channel(1, METRE, 14), (3, 12): name_teds("new")}
+    expected = [
+        "calibration key CAL_NONE -> CAL_SUPPLIED",
+        "channel type sensor -> event sensor",
+        "unit rad -> m",
+        "low limit 0 ° -> 1 m",
+        "high limit 57.2958 ° -> 2 m",
+        "stated uncertainty 0.572958 ° -> 0.02 m",
+        "SelfTest none -> provided",
+        "Sample, significant bits 12 -> 14",
+        "update time 100 ms -> 200 ms",
+        "sampling period 100 ms -> 200 ms",
+        "warm-up time 1 s -> 2 s",
+    ]
+    assert texts(diff_blocks(old, new)) == [
+        *(f"channel 3 (new): {text}." for text in expected),
+        "channel 3 (new): name old -> new.",
+    ]
+    gone = {(3, 3): new[3, 3]}
+    assert texts(diff_blocks(old, gone))[0] == "channel 3 (old): calibration key CAL_NONE -> CAL_SUPPLIED."
+    assert texts(diff_blocks(gone, new)) == ["channel 3 (new): name added."]
+    first = diff_blocks(old, new)[7]
+    assert (first.channel, first.access_code, first.field, first.before, first.after) == (3, 3, "SigBits", "12", "14")
+
+
+def test_the_node_and_its_blocks_are_compared_in_the_order_of_channels_and_classes() -> None:
+    classes = (1, 2, 3, 5, 7, 9, 12, 13, 128, 130, 131, 200)
+    words = (
+        "Meta-TEDS",
+        "MetaIdTEDS",
+        "channel description",
+        "calibration",
+        "end-user TEDS",
+        "TransferTEDS",
+        "name",
+        "PHY TEDS",
+        "Security TEDS",
+        "Origin TEDS",
+        "Certificate TEDS",
+        "manufacturer 200",
+    )
+    blocks = {(1, code): b"" for code in reversed(classes)}
+    assert texts(diff_blocks(blocks, {})) == [f"channel 1: {word} removed." for word in words]
+    assert texts(diff_blocks({}, {(1, 1): b"", (0, 12): b""})) == ["node: name added.", "channel 1: Meta-TEDS added."]
+
+    def meta(uuid: bytes, number: int) -> dict[tuple[int, int], bytes]:
+        times = [("OholdOff", number + 0.0), ("SHoldOff", number + 1.0), ("TestTime", 0.0)]
+        return {(0, 1): teds.compose(1, [("UUID", uuid), *times, ("MaxChan", number + 2)])}
+
+    assert texts(diff_blocks(meta(bytes(10), 1), meta(bytes(9) + b"\1", 2))) == [
+        "node: UUID 00000000000000000000 -> 00000000000000000001.",
+        "node: operation time-out 1 s -> 2 s.",
+        "node: slow-access time-out 2 s -> 3 s.",
+        "node: number of channels 3 -> 4.",
+    ]
+    (whole,) = meta(bytes(10), 1).values()
+    mended = {(0, 1): whole[:-1] + bytes([whole[-1] ^ 1])}
+    assert texts(diff_blocks({(0, 1): whole}, mended)) == ["node: Meta-TEDS: the same content, other octets."]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("a" * 48, "b" * 48, f"node: name {'a' * 48} -> {'b' * 48}."),
+        ("a" * 48, "b" * 49, f"node: name {'a' * 48} -> 49 octets."),
+        ("a" * 50, "b" * 49, "node: name is another."),
+        ("a", "", "node: name a -> nothing."),
+    ],
+)
+def test_a_text_is_printed_up_to_48_letters(old: str, new: str, text: str) -> None:
+    assert texts(diff_blocks({(0, 12): name_teds(old)}, {(0, 12): name_teds(new)})) == [text]
+
+
+@pytest.mark.parametrize(
+    ("intercept", "slope", "text"),
+    [
+        (0.0, 1.00051, "gain +0.051 %"),
+        (0.0, 1.0004, "gain +0.04 %"),
+        (0.01, 1.0, "at the low end +0.01 N, at full scale +0.01 N"),
+        (-0.01, 1.0, "at the low end -0.01 N, at full scale -0.01 N"),
+    ],
+)
+def test_small_changes_of_a_curve_are_stated_to_the_noise(
+    finger: Profile, intercept: float, slope: float, text: str
+) -> None:
+    old, new = (
+        finger.build(UUID, calibration={1: line(offset, gain * 43.75 / 65535)}).blocks
+        for offset, gain in ((0.0, 1.0), (intercept, slope))
+    )
+    (change,) = diff_blocks(old, new)
+    assert change.text.startswith(f"channel 1 (taxel 1): {text}")
+    assert change.text.endswith(", stated uncertainty 0.2 N.")
+
+
+def test_a_calibration_that_cannot_be_computed_is_compared_field_by_field(finger: Profile) -> None:
+    good = finger.build(UUID, calibration={1: line(0, 1e-4)}).blocks
+    (coefficients,) = [field for field in teds.decode(good[1, 5]).fields if field.name == "Coefs"]
+    kept = [part for part in tuples(unframe(good[1, 5])) if part.type != coefficients.type]
+    bad = {**good, (1, 5): frame(b"".join(raw_tuple(part.type, part.value) for part in kept))}
+    (change,) = diff_blocks(good, bad)
+    assert (change.field, change.after) == ("Coefs", "")
+    assert change.text == "channel 1 (taxel 1): Coefs removed (was 0, 0.0001)."

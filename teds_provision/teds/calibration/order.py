@@ -41,8 +41,10 @@ class CalibrationOrder:
     def number(self, key: str) -> float | None:
         """Return the number of a key."""
         value = self.get(key)
-        if value is None:
-            return None
+        return None if value is None else self.as_number(key, value)
+
+    def as_number(self, key: str, value: object) -> float:
+        """Return ``value``, which the file has at a key, as a number."""
         try:
             number = float(value) if isinstance(value, (str, int, float)) and not isinstance(value, bool) else None
         except (ValueError, OverflowError):
@@ -251,15 +253,14 @@ def _uncertainty(order: CalibrationOrder, unit: WrittenUnit) -> float | None:
     value = order.get("uncertainty")
     if isinstance(value, str) and " " in value.strip():
         number, _, text = value.strip().partition(" ")
-        order.values["uncertainty"] = (number, order.values["uncertainty"][1])
         try:
             written = parse_unit(text)
         except BadDataError as error:
             raise order.wrong("uncertainty", f"{error.message} {error.hint}") from error
         if written.units != unit.units:
             raise order.wrong("uncertainty", f'"{text}" is not of the same kind as "{unit.text}".')
-        plain = order.number("uncertainty")
-        found = None if plain is None else unit.difference_from_si(written.difference_to_si(plain))
+        plain = order.as_number("uncertainty", number)
+        found: float | None = unit.difference_from_si(written.difference_to_si(plain))
     else:
         found = order.number("uncertainty")
     if found is not None and found < 0:

@@ -229,7 +229,7 @@ class _Walk(Head):
                 fields.append(Field(kind, "TEDSID", tuple(raw), raw, at))
             else:
                 spec = spec_of.get(kind)
-                if kind <= last:
+                if kind < last or kind in seen:
                     self.order(kind, last, spec, at, seen)
                 last = kind
                 seen.add(kind)
@@ -273,12 +273,11 @@ class _Walk(Head):
 
     def order(self, kind: int, last: int, spec: FieldSpec | None, at: int, seen: set[int]) -> None:
         name = spec.name if spec is not None else ""
+        which = f"The field {kind} {name}".rstrip()
         if kind in seen and not (spec is not None and spec.repeats) and kind < MANUFACTURER:
-            self.find(
-                "warning", "repeated", f"The field {kind} {name} occurs more than once.", at, name, "once", "again"
-            )
+            self.find("warning", "repeated", f"{which} occurs more than once.", at, name, "once", "again")
         if kind < last:
-            message = f"The field {kind} {name} stands behind {last}."
+            message = f"{which} stands behind {last}."
             self.find("warning", "order", message, at, name, "ascending types", f"{kind} behind {last}")
 
     def missing(self, seen: set[int], start: int) -> None:
