@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from teds_provision.errors import BadDataError
 from teds_provision.node.hardware.board import ActuatorReading, Battery, Board
 from teds_provision.node.hardware.clock import NodeClock
 from teds_provision.node.node_template import create
@@ -184,7 +186,9 @@ def test_a_simulation_takes_the_clock_over_and_gives_it_back() -> None:
     seen.clear()
     clock.advance(0.25, lambda: None)
     assert (clock.tick(), clock.step) == (500_000_000, 499_999_960), "it never goes back"
-    assert seen == [("due", 500_000_000)] * 2
+    clock.advance(0.5, lambda: None)
+    assert clock.step == 499_999_960
+    assert seen == [("due", 500_000_000)] * 4
     clock.advance(10.0, lambda: None)
     assert (clock.tick(), clock.step) == (10_000_000_000, 0xFFFFFFFF)
     clock.host_clock()
@@ -280,3 +284,33 @@ def test_a_self_test_takes_a_tenth_of_a_second_to_ten(stated: float, seconds: fl
     assert (board.testing(2), board.testing(3), board.testing(1)) == (True, True, False)
     now[0] += 1
     assert not board.testing(2)
+
+
+def altered(number: int, **changes: Any) -> Sheet:
+    """Return the gripper with one channel changed."""
+    made = sheet("gripper")
+    channels = tuple(replace(each, **changes) if each.number == number else each for each in made.channels)
+    return replace(made, channels=channels)
+
+
+def test_an_actuator_without_a_name_is_shown_and_not_told_to_the_source() -> None:
+    source, shown = Given(), list[ActuatorReading]()
+    board = Board(altered(1, name=""), source=source, shown=shown.append)
+    board.apply({1: b"\x01\x00"})
+    assert (shown[0].name, shown[0].raw) == ("", 256.0)
+    assert source.log == []
+
+
+def test_a_channel_without_a_form_of_sample_is_no_hardware() -> None:
+    with pytest.raises(BadDataError, match="how a sample of channel 2 is coded"):
+        Board(altered(2, sample=None))
+
+
+@pytest.mark.parametrize(
+    ("period", "shortest"),
+    [(0.001, 999_999), (1.0, 999_999_000), (0.0, 1), (-1.0, 1), (math.nan, 1), (math.inf, 1), (1e-9, 1)],
+)
+def test_the_shortest_period_of_a_channel_is_its_own_less_a_millionth(period: float, shortest: int) -> None:
+    made = sheet("gripper").channels[1]
+    board = Board(altered(2, timing=replace(made.timing, period=period)))
+    assert board.channels[2].shortest == shortest
