@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 from teds_provision import __version__
-from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError, StoreError
-from teds_provision.files import SHARED, holds, write_whole
+from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError, StoreError, UsageError
+from teds_provision.files import SHARED, holds, write_new
 from teds_provision.protocol.keys import Credentials, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
@@ -20,6 +22,7 @@ from teds_provision.station.store.records import utc_now
 from teds_provision.teds.codec import security
 
 TOOL = f"teds-provision {__version__}"
+_EVIDENCE_FILE: Final = re.compile(r"([0-9a-f]{20})\.([1-9][0-9]{0,9})\.json", re.ASCII)
 
 
 def sign_evidence(
@@ -66,24 +69,61 @@ def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes
 def export(station: Station, rows: Iterable[EvidenceRow], folder: Path, *, write: bool = True) -> dict[Path, bool]:
     """Write documents as ``UUID.N.json``; return every file, and True for each new one.
 
-    N counts all documents of a board that are kept here, whichever are chosen. Each file is written whole; raises
-    StoreError if one cannot be.
+    N counts all documents of a board that are kept here, whichever are chosen. A document that the folder holds under
+    another number stays there, and a number that another document has (another station's, or one from before the clock
+    was set back) is passed over: no file is replaced. Each is written whole; raises StoreError if one cannot be.
     """
     files: dict[Path, bool] = {}
     numbers: dict[bytes, dict[str, int]] = {}
     if write:
         make_folder(folder)
+    there = _evidence_files(folder)
     for row in rows:
         if row.uuid not in numbers:
             ordered = sorted(
                 station.plant.line.evidence(uuid=row.uuid), key=lambda row: (row.finished, row.attempt, row.sha256)
             )
             numbers = {row.uuid: {row.sha256: number for number, row in enumerate(ordered, 1)}}
-        path = folder / f"{row.uuid.hex()}.{numbers[row.uuid][row.sha256]}.json"
-        files[path] = not holds(path, row.document)
-        if files[path] and write:
-            write_whole(path, [row.document], mode=SHARED)
+        name, number = row.uuid.hex(), numbers[row.uuid][row.sha256]
+        taken = there.setdefault(name, set())
+        same = (folder / f"{name}.{known}.json" for known in sorted(taken, key=lambda known: (known != number, known)))
+        path = next((path for path in same if holds(path, row.document)), None)
+        if path is not None:
+            files[path] = False
+            continue
+        path = _new_file(folder, name, number, taken, row.document if write else None)
+        files[path] = True
     return files
+
+
+def _evidence_files(folder: Path) -> dict[str, set[int]]:
+    """Return the numbers that the files of each board have in a folder, by its UUID."""
+    found: dict[str, set[int]] = {}
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for path in folder.iterdir():
+            match = _EVIDENCE_FILE.fullmatch(path.name)
+            if match is not None:
+                found.setdefault(match[1], set()).add(int(match[2]))
+    return found
+
+
+def _new_file(folder: Path, name: str, number: int, taken: set[int], document: bytes | None) -> Path:
+    """Write a document under the next number that is free (None: only choose one), also if two stations write at once.
+
+    Raises StoreError.
+    """
+    while True:
+        while number in taken:
+            number += 1
+        taken.add(number)
+        path = folder / f"{name}.{number}.json"
+        if document is None:
+            return path
+        try:
+            write_new(path, document, mode=SHARED)
+        except UsageError:
+            continue
+        return path
 
 
 def make_folder(folder: Path) -> None:

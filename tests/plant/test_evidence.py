@@ -9,7 +9,7 @@ import json
 import os
 import signal
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +22,7 @@ from securesystemslib.signer import SSlibKey
 
 from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, TedsProvisionError
 from teds_provision.plant.commands import line as line_command
-from teds_provision.plant.evidence import sign_evidence
+from teds_provision.plant.evidence import export, sign_evidence
 from teds_provision.plant.line import _firmware_in_session, _named_in
 from teds_provision.plant.verify_evidence import EvidenceTotals, JudgedEvidence
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
@@ -32,6 +32,7 @@ from teds_provision.protocol.plant.evidence import EvidenceClaim
 from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.firmware import read_firmware
 from teds_provision.provisioning.identify import identify
+from teds_provision.station.plant.line import EvidenceRow
 from teds_provision.station.station import Station
 from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.codec.access_code import AccessCode
@@ -60,6 +61,46 @@ def test_evidence_holds_under_the_ca_of_its_owner(station: Station, board: Board
     assert faults(station, document) == []
     assert (evidence.uuid, evidence.verdict, evidence.operator) == (board.uuid, "passed", "A. Meier")
     assert evidence.facts.steps == (("identify", "done", 41), ("write", "done", 1250))
+
+
+def kept_evidence(station: Station, uuid: bytes, finished: str, document: bytes) -> bytes:
+    """Keep a document (any octets) as evidence of a board."""
+    digest = hashlib.sha256(document).hexdigest()
+    with station.transaction():
+        station.plant.line.add_evidence(EvidenceRow(digest, uuid, None, None, 1, "passed", finished, document))
+    return document
+
+
+def exported(station: Station, folder: Path, **more: bool) -> dict[str, bool]:
+    """Export all evidence of a station; return the names of files, and which are new."""
+    found = export(station, station.plant.line.evidence(), folder, **more)
+    return {path.name: new for path, new in found.items()}
+
+
+def test_evidence_of_two_stations_of_one_board_in_one_folder_replaces_nothing(station: Station, tmp_path: Path) -> None:
+    """The second station's file took the place of the first one's proof, without a word."""
+    uuid, proof = bytes(range(10)), tmp_path / "proof"
+    one = kept_evidence(station, uuid, "2026-11-28T10:00:00Z", b"one")
+    with closing(make_station(tmp_path / "other", "other")) as other:
+        two = kept_evidence(other, uuid, "2026-11-28T11:00:00Z", b"two")
+        three = kept_evidence(other, uuid, "2026-11-28T12:00:00Z", b"three")
+        first, second, third = (f"{uuid.hex()}.{number}.json" for number in (1, 2, 3))
+        assert exported(station, proof) == {first: True}
+        assert exported(other, proof, write=False) == {second: True, third: True}
+        for new in (True, False):
+            assert exported(other, proof) == {second: new, third: new}
+    assert exported(station, proof) == {first: False}
+    assert [(proof / name).read_bytes() for name in (first, second, third)] == [one, two, three]
+
+
+def test_evidence_keeps_its_file_when_the_clock_was_set_back(station: Station, tmp_path: Path) -> None:
+    uuid, proof = bytes(range(10)), tmp_path / "proof"
+    ahead = kept_evidence(station, uuid, "2027-11-28T10:00:00Z", b"ahead")
+    exported(station, proof)
+    right = kept_evidence(station, uuid, "2026-11-28T10:00:00Z", b"right")
+    first, second = (f"{uuid.hex()}.{number}.json" for number in (1, 2))
+    assert exported(station, proof) == {second: True, first: False}
+    assert [(proof / name).read_bytes() for name in (first, second)] == [ahead, right]
 
 
 def test_public_verifiers_accept_it(station: Station, document: bytes) -> None:

@@ -639,7 +639,8 @@ def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
 def export(app: App, folder: Path, uuids: tuple[str, ...], job: str | None, dry_run: bool) -> None:
     """Write evidence to files, UUID.N.json.
 
-    One file per board and attempt; a file with the same content is left alone.
+    One file per board and attempt; no file is replaced. If another station's evidence of a board is there, that of this
+    one gets the next numbers.
     """
     station = app.station()
     files = plant.evidence.export(station, _rows(station, uuids, job), folder, write=not dry_run)
