@@ -74,7 +74,7 @@ def line(record: Record) -> bytes:
 
 def is_lines(octets: bytes) -> bool:
     """Return True if a file begins as a trace of lines does."""
-    return octets[:64].lstrip().startswith(b'{"format": "' + FORMAT.encode())
+    return octets[:64].lstrip().startswith(f'{{"format": "{FORMAT}"'.encode())
 
 
 def read_lines(octets: bytes) -> Iterator[Record]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -111,6 +113,190 @@ def test_every_frame_has_words(identifier: int, octets: bytes, direction: Direct
 )
 def test_frames_of_the_bus_are_named(identifier: int, octets: str, words: str) -> None:
     assert can_words(identifier, bytes.fromhex(octets)) == words
+
+
+@pytest.mark.parametrize(
+    ("octets", "direction", "words"),
+    [
+        ("", "out", "empty"),
+        ("e080", "out", "RATS"),
+        ("3004", "out", "READ from page 4"),
+        ("a205deadbeef", "out", "WRITE of page 5"),
+        ("00a4040007", "out", "SELECT"),
+        ("00b0000010", "out", "READ BINARY"),
+        ("00d6000002", "out", "UPDATE BINARY"),
+        ("00a404", "out", "3 octets"),
+        ("0a", "in", "ACK"),
+        ("01", "in", "NAK 1"),
+        ("000102030405060708090a0b0c0d0e0f", "in", "16 octets of a Type 2 tag"),
+        ("020102030405060708090a0b0c0d9000", "in", "I block 0, 15 octets, status 9000"),
+        ("0300b00002", "out", "I block 1, 4 octets: READ BINARY 0002"),
+        ("0200a4", "out", "I block 0, 2 octets"),
+        ("139000", "in", "I block 1, goes on, 2 octets"),
+        ("02900000", "in", "I block 0, 3 octets, status 0000"),
+        ("0290", "in", "I block 0, 1 octets"),
+        ("a2", "out", "R block 0, ACK"),
+        ("b3", "out", "R block 1, NAK"),
+        ("a300", "in", "R block 1, ACK"),
+        ("c200", "in", "S block, DESELECT"),
+        ("f20b", "in", "S block, more time x 11"),
+        ("f2cb", "out", "S block, more time x 11"),
+        ("4400", "in", "2 octets"),
+    ],
+)
+def test_frames_of_a_tag_are_named(octets: str, direction: Direction, words: str) -> None:
+    assert nfc_words(bytes.fromhex(octets), direction) == words
+
+
+def le(*numbers: int) -> bytes:
+    return struct.pack(f"<{len(numbers)}I", *numbers)
+
+
+def option(code: int, value: bytes) -> bytes:
+    return struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4)
+
+
+def packet(interface: int, moment: int, data: bytes, options: bytes) -> bytes:
+    """An Enhanced Packet Block as the draft lays it out."""
+    body = (
+        le(interface, moment >> 32, moment & 0xFFFFFFFF, len(data), len(data)) + data + bytes(-len(data) % 4) + options
+    )
+    return le(6, len(body) + 12) + body + le(len(body) + 12)
+
+
+OUT, IN, END = option(2, le(2)), option(2, le(1)), bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("record", "octets"),
+    [
+        (
+            Record(1.5, "out", "can", "frame", b"\1\2\3", "words", identifier=0x18DA21F1),
+            packet(0, 1_500_000, b"\x98\xda\x21\xf1\3\0\0\0\1\2\3", OUT + END),
+        ),
+        (
+            Record(5_000_000_000.25, "in", "can", "frame", bytes(12), identifier=1, fd=True),
+            packet(0, 5_000_000_000_250_000, b"\x80\0\0\1\x0c\5\0\0" + bytes(12), IN + END),
+        ),
+        (
+            Record(0.0, "out", "nfc", "frame", b"\xe0\x80", "RATS"),
+            packet(1, 0, b"\0\xfa\0\2\xe0\x80", OUT + END),
+        ),
+        (
+            Record(0.0, "in", "nfc", "frame", bytes(300)),
+            packet(1, 0, b"\0\xfb\1\x2c" + bytes(300), IN + END),
+        ),
+        (
+            Record(0.0, "in", "ble", "frame", b"\7"),
+            packet(2, 0, b"\7", option(1, b"") + option(1, b"link: ble frame") + IN + END),
+        ),
+        (
+            Record(1.0, "out", "nfc", "message", b"\1\2", "List", opened=b"\xab", sealed=True, uuid="8d4d"),
+            packet(
+                2, 1_000_000, b"\1\2",
+                option(1, b"List") + option(1, b"opened: ab") + option(1, b"node: 8d4d")
+                + option(1, b"link: nfc message") + OUT + END,
+            ),
+        ),
+    ],
+    ids=["can", "can-fd", "nfc", "nfc-long", "ble", "message"],
+)  # fmt: skip
+def test_a_record_as_a_block_of_pcapng(record: Record, octets: bytes) -> None:
+    assert pcapng.block(record).hex() == octets.hex()
+    (again,) = pcapng.read_pcapng(pcapng.head() + octets)
+    assert (again.time, again.direction, again.layer, again.octets) == (
+        record.time, record.direction, record.layer, record.octets
+    )  # fmt: skip
+    assert (again.identifier, again.fd, again.opened, again.sealed, again.uuid) == (
+        record.identifier, record.fd, record.opened, record.sealed, record.uuid
+    )  # fmt: skip
+
+
+def test_the_head_of_pcapng_has_three_interfaces_with_times_in_microseconds() -> None:
+    head, names = pcapng.head(), ((227, b"can"), (264, b"nfc"), (147, b"messages"))
+    interfaces = b""
+    for link_type, name in names:
+        body = struct.pack("<HHI", link_type, 0, 0) + option(2, name) + option(9, b"\6") + END
+        interfaces += le(1, len(body) + 12) + body + le(len(body) + 12)
+    assert head.endswith(interfaces)
+    section = head.removesuffix(interfaces)
+    assert section[:4] == b"\x0a\x0d\x0d\x0a"
+    assert section[8:24] == le(0x1A2B3C4D) + struct.pack("<HHq", 1, 0, -1)
+    assert b"teds-provision " in section
+
+
+@pytest.mark.parametrize(
+    ("resolution", "ticks", "seconds"), [(6, 1_500_000, 1.5), (9, 1_500_000_000, 1.5), (0x83, 12, 1.5), (3, 1500, 1.5)]
+)
+def test_times_have_the_resolution_of_their_interface(resolution: int, ticks: int, seconds: float) -> None:
+    body = struct.pack("<HHI", 264, 0, 0) + option(9, bytes((resolution,))) + END
+    capture = pcapng.head() + le(1, len(body) + 12) + body + le(len(body) + 12)
+    reader, tag = b"\0\xfe\0\1\x0a", b"\0\xff\0\1\x0a"  # events of other programs: with a CRC error or so
+    found = list(pcapng.read_pcapng(capture + packet(3, ticks, reader, b"") + packet(3, ticks, tag, b"")))
+    assert [(record.time, record.direction) for record in found] == [(seconds, "out"), (seconds, "in")]
+
+
+def test_a_trace_of_a_later_format_is_none_of_ours(tmp_path: Path) -> None:
+    (tmp_path / "t").write_bytes(b'{"format": "teds-trace/12", "made_by": "x"}\n')
+    with pytest.raises(BadDataError, match="is not a trace"):
+        read_trace(tmp_path / "t")
+
+
+def test_a_record_as_a_line() -> None:
+    sealed = Record(1.5, "out", "nfc", "message", b"\1", "List", opened=b"\xab", sealed=True, uuid="8d4d")
+    assert sealed.as_json() == {
+        "time": "1970-01-01T00:00:01.500000Z", "direction": "out", "link": "nfc", "layer": "message", "command": "List",
+        "sealed": True, "octets": "01", "opened": "ab", "uuid": "8d4d",
+    }  # fmt: skip
+    frame = Record(0.0, "in", "can", "frame", b"", "empty", identifier=0x1F, fd=True)
+    assert frame.as_json() == {
+        "time": "1970-01-01T00:00:00.000000Z", "direction": "in", "link": "can", "layer": "frame", "command": "empty",
+        "sealed": False, "octets": "", "identifier": "0000001f", "fd": True,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [{"direction": "up"}, {"layer": "octet"}, {"octets": "0"}, {"time": "now"}])
+def test_a_line_that_is_no_record_is_named_unless_it_was_cut_off(change: dict[str, str]) -> None:
+    good = lines.line(Record(0.0, "in", "can", "frame", b""))
+    bad = json.dumps({**json.loads(good), **change}).encode()
+    with pytest.raises(BadDataError, match="Line 4 of the trace"):
+        list(lines.read_lines(lines.head() + good + b"\n" + bad + b"\n" + good))
+    assert len(list(lines.read_lines(lines.head() + good + bad))) == 1
+
+
+def test_a_trace_that_nothing_was_written_to_is_removed_if_it_is_not_kept(tmp_path: Path) -> None:
+    for keep, written in ((True, False), (False, True), (False, False)):
+        path = tmp_path / f"{keep}-{written}.trace"
+        trace = open_trace(path, print)
+        assert trace.is_empty
+        if written:
+            trace.frame("can", "out", b"\2", identifier=1)
+        assert trace.is_empty is not written
+        trace.close(keep_empty=keep)
+        trace.close(keep_empty=False)
+        assert path.exists() == (keep or written)
+
+
+def test_a_full_disk_ends_the_trace_once_and_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    path = tmp_path / "t.trace"
+    trace = open_trace(path, said.append)
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda descriptor, octets: write(descriptor, octets[:7]))
+    trace.frame("can", "out", b"\2", identifier=1)
+    assert len(list(read_trace(path))) == 1, "what the system takes by pieces is written whole"
+
+    def full(_descriptor: int, _octets: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    for _ in range(2):
+        trace.frame("can", "out", b"\3", identifier=1)
+    monkeypatch.setattr(os, "write", write)
+    trace.frame("can", "out", b"\4", identifier=1)
+    trace.close()
+    assert said == [f"The trace {path} ends here: No space left on device. The command goes on."]
+    assert [record.octets for record in read_trace(path)] == [b"\2"]
 
 
 def test_a_capture_by_another_program_is_read() -> None:
