@@ -408,3 +408,125 @@ def test_control_characters_in_a_name_do_not_reach_the_terminal(show, tmp_path):
 
 def test_written_hex_of_one_teds_needs_no_place():
     assert write_blocks([TedsBlock(None, 12, teds.compose(12, {"Format": 0, "TCName": "a"}))], "hex").count("#") == 0
+
+
+# -- whole outputs -------------------------------------------------------------------------------------------------
+
+NAME_TEDS = bytes.fromhex("0000001f0304000c01010401000512") + b"temperature sensor"
+FIELDS = (
+    "offset  type  field   value               meaning",
+    "     4     3  TEDSID  00 0c 01 01",
+    "    10     4  Format  0                   user defined",
+    "    13     5  TCName  temperature sensor",
+)
+
+
+def checked(octets):
+    """Return a TEDS with its checksum: all octets but its own, complemented (IEEE 1451.0-2007, 5.5.4)."""
+    return octets + (0xFFFF - sum(octets)).to_bytes(2, "big")
+
+
+@pytest.fixture
+def name_file(tmp_path):
+    path = tmp_path / "name.hex"
+    path.write_text(checked(NAME_TEDS).hex())
+    return path
+
+
+def lines_of(text):
+    return [line.rstrip() for line in text.splitlines()]
+
+
+def test_a_teds_as_a_table(show, name_file, tmp_path):
+    code, out, err = show(name_file)
+    assert (code, err) == (0, "")
+    assert lines_of(out) == ["XdcrName (12) · 2007 edition · 35 octets · clean", *FIELDS]
+    bare = tmp_path / "bare.hex"
+    bare.write_text(NAME_TEDS[4:].hex())
+    assert lines_of(show(bare)[1]) == [
+        "XdcrName (12) · 2007 edition · 29 octets · bare data block · block-clean",
+        "offset  type  field   value               meaning",
+        "     0     3  TEDSID  00 0c 01 01",
+        "     6     4  Format  0                   user defined",
+        "     9     5  TCName  temperature sensor",
+    ]
+    wrong = tmp_path / "wrong.hex"
+    wrong.write_text((NAME_TEDS + b"\0\0").hex())
+    right = f"{0xFFFF - sum(NAME_TEDS):04X}"
+    code, out, _ = show(name_file, wrong)
+    assert code == 0
+    first, *rest = lines_of(out)
+    assert first.startswith(f"{name_file} ──")
+    assert rest[:5] == ["XdcrName (12) · 2007 edition · 35 octets · clean", *FIELDS]
+    assert rest[5].startswith(f"{wrong} ──")
+    assert rest[6:] == [
+        "XdcrName (12) · 2007 edition · 35 octets · frame-bad",
+        *FIELDS,
+        f"error  octet 33, frame-checksum: The checksum is 0000, the octets give {right}.",
+    ]
+    assert show(wrong, "--strict")[0] == 8
+    assert lines_of(show(name_file, "--edition", "2024")[1])[0] == "XdcrName (12) · 2024 edition · 36 octets · clean"
+
+
+def test_a_teds_as_json(show, show_json, name_file):
+    one = {
+        "file": str(name_file), "edition": 2024, "channel": None, "access_code": 12, "family": 0, "subfamily": 255,
+        "version": 2, "width": 1, "framed": True, "name": "XdcrName",
+        "fields": [
+            {"type": 4, "name": "Format", "kind": "integer", "value": 0, "offset": 11, "text": "0",
+             "meaning": "user defined"},
+            {"type": 5, "name": "TCName", "kind": "text", "value": "temperature sensor", "offset": 14,
+             "text": "temperature sensor"},
+        ],
+        "verdict": "clean", "findings": [], "conversion": [],
+    }  # fmt: skip
+    code, found = show_json(name_file, "--edition", "2024")
+    assert (code, found) == (0, {**one, "format": "teds/1", "teds": [one]})
+    code, pretty, _ = show(name_file, "--format", "json", "--edition", "2024")
+    assert (code, json.loads(pretty)) == (0, found)
+    assert pretty.startswith('{\n "file": ')
+    code, several = show_json(name_file, name_file)
+    assert (code, set(several), len(several["teds"])) == (0, {"format", "teds"}, 2)
+
+
+def test_two_teds_of_one_file_stand_apart(show, tmp_path):
+    path = tmp_path / "node.json"
+    path.write_text(image_of("temperature-sensor").to_json())
+    out = lines_of(show(path)[1])
+    heads = [at for at, line in enumerate(out) if " edition · " in line]
+    assert [out[at - 1] for at in heads[1:]] == [""] * (len(heads) - 1)
+    assert out[heads[1]].startswith("channel 0 · XdcrName (12) · 2007 edition")
+
+
+def test_equal_files_show_no_difference(show, name_file):
+    assert show("--diff", name_file, name_file)[:2] == (0, "no difference\n")
+    code, found, _ = show("--diff", name_file, name_file, "--format", "json")
+    assert (code, json.loads(found)) == (0, {"changes": [], "guard": []})
+
+
+def test_an_unknown_file_names_the_commands_of_a_node(show, tmp_path):
+    code, _, err = show(tmp_path / "8d4d")
+    assert code == 3
+    assert "show decodes files. Of a node: nodes UUID, or read UUID --output FILE." in err
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ([], "No file given."),
+        (["a", "--channel", "1"], "--channel works with --plot."),
+        (["--diff", "a", "b", "c"], "--diff compares two files and cannot be combined with anything else."),
+        (["--diff", "a", "b", "--format", "xml"], "--diff compares two files and cannot be combined"),
+        (["--diff", "a", "b", "--plot", "p.svg"], "--diff compares two files and cannot be combined"),
+    ],
+)
+def test_what_show_cannot_mean(show, words, why):
+    code, _, err = show(*words)
+    assert code == 2
+    assert why in err
+    assert show("a", "--format", "xml", before=("--json",))[0] == 2
+
+
+def test_a_plot_is_of_one_file(show, name_file, tmp_path):
+    code, _, err = show(name_file, name_file, "--plot", tmp_path / "p.svg")
+    assert (code, "--plot works with one file." in err) == (2, True)
