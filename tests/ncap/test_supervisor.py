@@ -15,10 +15,20 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
 from teds_provision import client
-from teds_provision.errors import NodeBusyError, NoNodeError, PolicyError, StoreError
+from teds_provision.errors import (
+    FrozenError,
+    NodeBusyError,
+    NoNodeError,
+    NotFoundError,
+    PolicyError,
+    StoreError,
+    UsageError,
+)
 from teds_provision.links.discovery import Sighting
-from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.blocks import InvalidValues, NodeReport
 from teds_provision.measure.buses import Buses
+from teds_provision.measure.matching import NodeLoad, NodeMatch
+from teds_provision.ncap import measurement_supervisor
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, NodeLoan
 from teds_provision.ncap.membership import Member, Membership
@@ -385,6 +395,7 @@ def test_a_measurement_that_is_stopped_does_not_begin_again_with_other_nodes(ser
             running.stop.set()
         service.measurements._finish(running)
         assert running.phase is (Phase.OVER if stopped else Phase.LOCKING)
+        assert running.again is stopped, "once"
         running.phase = Phase.OVER
 
 
@@ -413,3 +424,320 @@ def test_a_node_whose_values_come_has_no_problem_any_more(service: Service) -> N
         service.measurements._report(running, NodeReport(NODE, state, why))
         assert (service.directory.seen(NODE).problem is not None) is problem
         assert service.directory.seen(NODE).present is (state != "refused")
+
+
+def test_a_measurement_is_shown_with_all_that_was_asked_and_what_its_nodes_report(service: Service) -> None:
+    running = listed(service, NODE, OTHER)
+    running.kept = replace(
+        running.kept, channels=(1, 2), rate=50.0, dead_man=500, created=1700000000.0, owner="page", sinks=("ros2",)
+    )
+    running.state, running.why = "running", "1 of 2 nodes is missing"
+    running.job = cast(
+        Any,
+        SimpleNamespace(
+            measurement=None,
+            sinks=[SimpleNamespace(files=(Path("/r/a.csv"), Path("/r/a.2.csv"))), SimpleNamespace(files=())],
+        ),
+    )
+    said = NodeReport(NODE, "running", "slow", samples=9, lost=3, late=2, bad=1, invalid=4, clock_error=0.001, time=5.0)
+    service.measurements._report(running, replace(said, invalid_why=(InvalidValues(1, "over range", 4),)))
+    report = {
+        "uuid": NODE, "state": "running", "why": "slow", "samples": 9, "lost": 3, "late": 2, "bad": 1, "invalid": 4,
+        "clock_error": 0.001, "invalid_why": [{"channel": 1, "why": "over range", "count": 4}],
+    }  # fmt: skip
+    assert service.measurements._json(running) == {
+        "group": None,
+        "uuids": [NODE, OTHER],
+        "match": None,
+        "frozen": False,
+        "channels": [1, 2],
+        "rate": 50.0,
+        "kind": None,
+        "trigger": False,
+        "sinks": ["ros2"],
+        "actuators": False,
+        "dead_man": 500,
+        "scalar_rate": 10.0,
+        "id": "1",
+        "created": 1700000000.0,
+        "owner": "page",
+        "process": None,
+        "state": "running",
+        "why": "1 of 2 nodes is missing",
+        "lower_rate": None,
+        "nodes": [report, {"uuid": OTHER, "state": "waiting", "why": ""}],
+        "files": ["/r/a.csv", "/r/a.2.csv"],
+    }
+    running.kept = replace(running.kept, owner="command", pid=7, started=12.5)
+    shown = service.measurements._json(running)
+    assert (shown["process"], shown["nodes"]) == ({"id": 7, "started": 12.5}, []), "a command's own reports are not here"
+
+
+def test_a_node_that_left_is_shown_until_it_is_meant_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    running = open_to(service, monkeypatch)
+    for node in (OTHER, NODE):
+        running.reports[node] = {"uuid": node, "state": "lost"}
+    running.membership.members[NODE] = Member()
+
+    def shown() -> list[str]:
+        return [report["uuid"] for report in service.measurements._json(running)["nodes"]]
+
+    assert shown() == [NODE, OTHER]
+    running.past.add(OTHER)
+    assert shown() == [NODE]
+
+
+def test_what_a_node_reports_is_an_event_and_its_state_on_the_page(service: Service) -> None:
+    running, seen = listed(service, NODE), list[tuple[str, str]]()
+    service.live.on_event = lambda event: (
+        seen.append((event["state"], event["why"])) if event["event"] == "measurement" and "uuid" in event else None
+    )
+    service.directory.note(NODE, heard={"x": 1}, looked=1.0)
+    table = (
+        ("waiting", "", 1, {"x": 1}, None),
+        ("waiting", "It is busy.", 1, {"x": 1}, "It is busy."),
+        ("waiting", "It is busy.", 1, {"x": 1}, "It is busy."),
+        ("running", "slowed", 2, None, None),
+        ("running", "slowed", 3, None, None),
+        ("lost", "Silent.", 3, None, "Silent."),
+        ("refused", "Banned.", 3, None, "Banned."),
+        ("refused", "Banned.", 3, None, "Banned."),
+        ("ended", "renamed", 3, None, "Banned."),
+    )
+    for state, why, _, heard, problem in table:
+        service.measurements._report(running, NodeReport(NODE, cast(Any, state), why))
+        row = service.directory.seen(NODE)
+        assert (row.heard, row.problem and row.problem["message"]) == (heard, problem), (state, why)
+    assert seen == [("waiting", "It is busy."), ("joined", "slowed"), ("left", "Silent."), ("waiting", "Banned.")]
+
+
+def test_a_node_that_leaves_as_its_measurement_is_stopped_says_so(service: Service) -> None:
+    running, seen = listed(service, NODE, OTHER), list[str]()
+    service.live.on_event = lambda event: seen.append(event["why"]) if event.get("state") == "left" else None
+    for node in (NODE, OTHER):
+        service.measurements._report(running, NodeReport(node, "running"))
+    service.measurements._report(running, NodeReport(NODE, "ended"))
+    service.measurements._report(running, NodeReport(NODE, "running"))
+    running.stop.set()
+    service.measurements._report(running, NodeReport(NODE, "ended"))
+    service.measurements._report(running, NodeReport(OTHER, "ended", "renamed"))
+    assert seen == ["", "the measurement ended", "renamed"]
+
+
+def test_a_rate_is_proposed_for_a_group_or_for_nodes(service: Service) -> None:
+    for named in ({}, {"group": "hand", "uuids": [NODE]}):
+        with pytest.raises(UsageError, match="for a group, or for nodes"):
+            service.measurements.proposed_rate(**cast(Any, named))
+    with pytest.raises(NotFoundError, match="nobody"):
+        service.measurements.proposed_rate(group="nobody")
+    assert service.measurements.proposed_rate(uuids=[NODE]) is None, "no datasheet of it is known"
+
+
+def test_a_report_of_a_measurement_that_a_node_has_left_is_no_problem_of_the_node(service: Service) -> None:
+    kept = KeptMeasurement("2", uuids=(bytes.fromhex(NODE),))
+    left = RunningMeasurement(kept, Membership(0.0), kept, phase=Phase.OVER)
+    listed(service, NODE)
+    service.measurements._report(left, NodeReport(NODE, "lost", "Silent."))
+    assert service.directory.seen(NODE).problem is None
+
+
+@pytest.mark.parametrize(
+    ("members", "error", "words"),
+    [
+        ({}, UsageError, "needs a group, nodes, or an expression"),
+        ({"group": "hand", "uuids": [NODE]}, UsageError, "needs a group, nodes, or an expression"),
+        ({"match": "all", "uuids": [NODE]}, UsageError, "needs a group, nodes, or an expression"),
+        ({"match": "group:nobody"}, NotFoundError, "nobody"),
+        ({"match": "all", "trigger": True}, UsageError, "cannot start together"),
+        ({"group": "nobody"}, NotFoundError, "nobody"),
+        ({"uuids": [NODE], "sinks": ["udp"]}, UsageError, "not a sink"),
+    ],
+)
+def test_what_can_never_be_measured_is_refused_and_not_kept(
+    service: Service, members: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        service.measurements.add(members)
+    assert service.station.measurements.all() == []
+    assert entries(service, "measure") == []
+
+
+def test_what_is_measured_already_is_refused_to_others_and_a_sink_named_twice_is_one(service: Service) -> None:
+    service.station.pins.put(WhitelistEntry(bytes.fromhex(NODE)))
+    node = {"uuids": [NODE]}
+    listed(service, NODE)
+    with pytest.raises(NodeBusyError, match=f"Node {NODE} is already being measured \\(1\\)."):
+        service.measurements.add(node)
+    del service.measurements._running["1"]
+    frozen = {"match": "name:x*", "trigger": True, "frozen": True, "sinks": ["ros2", "ros2"]}
+    made = service.measurements.add(frozen, owner="page")
+    kept = service.station.measurements.get(made["id"])
+    assert (kept.trigger, kept.sinks, kept.owner, kept.dead_man) == (True, ("ros2",), "page", 1000)
+    [begun] = entries(service, "measure")
+    assert begun.detail == {"id": made["id"], "match": "name:x*", "owner": "page", "nodes": []}
+
+
+def test_a_measurement_can_be_deleted_once_and_that_of_a_command_only_there(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed(service, NODE)
+    service.measurements.delete("1")
+    with pytest.raises(NotFoundError, match="'1'"):
+        service.measurements.delete("1")
+    monkeypatch.setattr(service.station.measurements, "all", lambda: [KeptMeasurement("9", owner="command", pid=4711)])
+    with pytest.raises(PolicyError, match=r"Measurement 9 belongs to the command measure \(process 4711\)"):
+        service.measurements.delete("9")
+
+
+def test_a_node_that_two_borrow_comes_back_when_the_last_one_returns_it(service: Service) -> None:
+    course, running = list[tuple[str, ...]](), listed(service, NODE)
+    running.job = cast(
+        Any,
+        SimpleNamespace(
+            kept=running.kept,
+            suspend_node=lambda uuid, why, seconds: course.append(("let go", why, f"{seconds:g}")) or True,
+            resume_node=lambda uuid: course.append(("resumed", uuid.hex())),
+        ),
+    )
+    loans = [NodeLoan(NODE, "let go for write"), NodeLoan(NODE, "let go for rename")]
+    assert [service.measurements.lend_node(loans[0]), service.measurements.lend_node(loans[1], 9.0)] == [True, True]
+    assert service.measurements.lent_for(NODE) == "let go for write"
+    running.asked_anew = False
+    service.measurements.return_node(loans[0])
+    assert (service.measurements.lent_for(NODE), running.asked_anew) == ("let go for rename", False)
+    service.measurements.return_node(loans[0])
+    assert service.measurements.lent_for(NODE) == "let go for rename", "what is returned twice is returned once"
+    service.measurements.return_node(loans[1])
+    assert (service.measurements.lent_for(NODE), running.asked_anew) == (None, True)
+    assert course == [("let go", "let go for write", "4"), ("let go", "let go for rename", "9"), ("resumed", NODE)]
+
+
+def test_a_node_that_is_not_let_go_in_time_or_is_in_a_frozen_measurement_is_lent_to_nobody(service: Service) -> None:
+    course, running = list[str](), listed(service, NODE)
+    running.job = cast(
+        Any,
+        SimpleNamespace(
+            kept=running.kept,
+            suspend_node=lambda _uuid, _why, _seconds: False,
+            resume_node=lambda uuid: course.append(uuid.hex()),
+        ),
+    )
+    with pytest.raises(NodeBusyError, match="was not released within 4 s"):
+        service.measurements.lend_node(NodeLoan(NODE, "let go for write"))
+    assert (course, service.measurements.lent_for(NODE)) == ([NODE], None), "it is measured on"
+    cast(Any, running.job).kept = replace(running.kept, frozen=True)
+    with pytest.raises(FrozenError, match=r"is in a frozen measurement \(1\)"):
+        service.measurements.lend_node(NodeLoan(NODE, "let go for write"))
+    assert service.measurements.lent_for(NODE) is None
+
+
+@pytest.mark.parametrize(
+    ("seen", "stored", "asked"), [(7, 9, [9]), (7, 7, []), (7, None, []), (None, 9, [])], ids=str
+)
+def test_a_node_that_got_another_address_is_asked_there_when_it_is_returned(
+    service: Service, seen: int | None, stored: int | None, asked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It announces no address that a command gave it, and would come back half a minute later."""
+    heard: list[tuple[int, float]] = []
+    discovery = SimpleNamespace(identify_at=lambda address, seconds: heard.append((address, seconds)))
+    sighting = None if seen is None else SimpleNamespace(address=seen)
+    monkeypatch.setattr(service.buses.presence, "seen_at", lambda _uuid: sighting)
+    monkeypatch.setattr(service.buses, "bus_of", lambda _sighting: SimpleNamespace(discovery=discovery))
+    monkeypatch.setattr(service.station.nodes, "get", lambda _uuid: SimpleNamespace(can_address=stored))
+    service.measurements._ask_where_it_is(bytes.fromhex(NODE))
+    assert heard == [(address, 1.0) for address in asked]
+
+
+def test_a_share_of_the_bus_is_reserved_only_for_a_node_that_finds_room(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, expected = open_to(service, monkeypatch), list[tuple[list[bytes], float]]()
+    share = SimpleNamespace(time=None, room=0.01, expect=lambda uuids, load: expected.append((uuids, load)))
+    sighting = SimpleNamespace(uuid=bytes.fromhex(NODE))
+    monkeypatch.setattr(service.buses.presence, "seen_at", lambda _uuid: sighting)
+    monkeypatch.setattr(service.buses, "bus_of", lambda _sighting: SimpleNamespace(share=share))
+    job: Any = SimpleNamespace(request=None)
+    for load, reserved in ((0.4, [([bytes.fromhex(NODE)], 0.4)]), (0.6, [])):
+        monkeypatch.setattr(measurement_supervisor, "load_of", lambda *_how, load=load: NodeLoad(load, 1, 1.0))
+        running.membership.members[NODE] = Member(joined=False)
+        expected.clear()
+        service.measurements._reserve(running, job, NODE)
+        assert (running.membership.members[NODE].load.bus, expected) == (load, reserved)
+
+
+def test_a_node_that_finds_no_room_waits_half_a_minute_and_says_so_once(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, seen = open_to(service, monkeypatch), list[dict[str, Any]]()
+    service.live.on_event = lambda event: seen.append(event) if event["event"] == "measurement" else None
+    service.locks.acquire(NODE, "measurement 1", frozen=True)
+    running.past.add(NODE)
+    monkeypatch.setattr(measurement_supervisor, "time", SimpleNamespace(monotonic=lambda: 100.0, time=lambda: 0.0))
+    for _ in range(2):
+        running.membership.members[NODE] = Member(joined=False, locked=True, load=NodeLoad(26.0, 1, 1.0))
+        service.measurements._join(running, cast(Any, None), NODE)
+        assert (service.locks.holder(NODE), running.membership.members) == (None, {})
+        waits = running.membership.waits[NODE]
+        assert (waits.at, waits.room) == (130.0, 0.5)
+    assert running.reports == {NODE: {"uuid": NODE, "state": "waiting", "why": "no room on the bus"}}
+    assert [(event["state"], event["uuid"], event["why"]) for event in seen] == [("waiting", NODE, "no room on the bus")]
+    assert running.past == set()
+
+
+@pytest.mark.parametrize(
+    ("phase", "match", "arrived", "pause"),
+    [
+        (Phase.ENDING, None, False, 0.05),
+        (Phase.LOCKING, None, False, 0.1),
+        (Phase.MEASURING, None, False, 0.5),
+        (Phase.SELECTING, None, False, 0.5),
+        (Phase.MEASURING, "all", False, 0.1),
+        (Phase.MEASURING, "all", True, 0.05),
+        (Phase.OVER, "all", True, None),
+    ],
+)
+def test_the_table_is_looked_at_as_often_as_its_most_urgent_measurement_needs(
+    service: Service, phase: Phase, match: str | None, arrived: bool, pause: float | None
+) -> None:
+    running = listed(service, NODE)
+    assert service.measurements._pause() is None
+    running.asked, running.phase = replace(running.asked, match=match), phase
+    if arrived:
+        running.membership.arrive(OTHER, 0.0)
+    slow = RunningMeasurement(running.kept, Membership(0.0), running.kept, phase=Phase.OVER)
+    slow.over.set()
+    service.measurements._running["0"] = slow
+    assert service.measurements._pause() == pause
+    running.phase = Phase.OVER
+
+
+def test_the_budget_counts_what_goes_to_topics_in_each_second(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(measurement_supervisor, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    service.measurements._messages = 100.0, 0
+    topics, file = (SimpleNamespace(budgeted=on, stats=SimpleNamespace(messages=0)) for on in (True, False))
+    monkeypatch.setattr(service.measurements, "_open_sinks", lambda: [("1", topics), ("1", file)])
+    found = []
+    for step, messages in ((0.9, 500), (0.1, 1000), (0.5, 5000), (1.5, 3000), (1.0, 0)):
+        now[0] += step
+        topics.stats.messages, file.stats.messages = messages, 10 * messages
+        found.append(service.measurements.budget())
+    assert found == [{"used": used, "limit": 5000} for used in (0.0, 1000.0, 1000.0, 1000.0, 0.0)]
+
+
+def test_an_expression_that_selects_only_nodes_with_a_key_and_a_datasheet_in_service(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uuids = [bytes([number]) * 10 for number in range(1, 7)]
+    monkeypatch.setattr(service.station.keys, "all_key_names", lambda: [(uuid, 1, 1) for uuid in uuids] * 2)
+    monkeypatch.setattr(
+        measurement_supervisor, "why_not_measured", lambda _station, uuid: "banned" if uuid == uuids[1] else ""
+    )
+    monkeypatch.setattr(service.measurements, "_is_retired", lambda uuid: uuid == uuids[2].hex())
+    monkeypatch.setattr(
+        service.station.datasheets, "datasheet", lambda uuid: None if uuid == uuids[3] else object()
+    )
+    monkeypatch.setattr(NodeMatch, "why_not", lambda _self, _station, uuid: "named x" if uuid == uuids[4] else "")
+    assert service.measurements._selected("all") == ([uuids[0], uuids[5]], "")
