@@ -8,6 +8,7 @@ Values are in the SI unit of the datasheet (``ChannelFacts.unit``); times are un
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -144,6 +145,17 @@ class InvalidValues:
     channel: int
     why: str
     count: int
+
+
+def nearest_float(raw: object) -> float:
+    """Return one raw value as the nearest float; NaN for octets, and for an integer that no float can hold.
+
+    A sample may have 255 octets; from the 129th on, an integer can be beyond every float.
+    """
+    try:
+        return float(raw) if isinstance(raw, int | float) else math.nan
+    except OverflowError:
+        return math.nan
 
 
 def why_invalid(found: Sequence[InvalidValues]) -> str:

@@ -6,6 +6,7 @@ for no stream are dropped.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -20,6 +21,7 @@ from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.protocol.operation.subscription import Receiver, StreamMessage
 
+_log = logging.getLogger(__name__)
 SLICE = 0.004  # seconds between checks for frames
 REST = 0.003  # seconds for which frames gather on one link: waking for each one costs more than reading it
 # seconds for which messages gather, to be opened and calibrated together: part of the 20 ms from tick to sink
@@ -239,6 +241,13 @@ class HearingThread:
             except LinkError as failure:
                 # The threads of the nodes get the same failure, report it, and open the link again.
                 self.failure = failure
+                self._stop.wait(0.5)
+            except Exception as bug:  # noqa: BLE001 - one node's message ends the hearing of no other node
+                _log.debug("Hearing on %s failed.", self._port.place, exc_info=True)
+                self.failure = LinkError(
+                    f"Unexpected {type(bug).__name__} in received data.",
+                    hint="This is a bug: please report it with -vv.",
+                )
                 self._stop.wait(0.5)
 
     def _hear(self) -> None:

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from teds_provision.arrays import NDArray, np
 from teds_provision.errors import NotFoundError
-from teds_provision.measure.blocks import Block, ChannelFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, nearest_float
 from teds_provision.ncap.bins import Bins, FewBins
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.model import Units
@@ -69,9 +69,7 @@ def raw_numbers(block: Block, column: int) -> NDArray[Any]:
     raw = block.raw[:, column]
     if raw.dtype != object:
         return np.asarray(raw, np.float64)
-    return np.array(
-        [float(number) if isinstance(number, int | float) else np.nan for number in raw.tolist()], np.float64
-    )
+    return np.array([nearest_float(number) for number in raw.tolist()], np.float64)
 
 
 class _Channel:

@@ -402,3 +402,37 @@ def test_a_period_of_less_than_half_or_more_than_twice_the_asked_one_is_a_gap_or
         interpreter._spaced(message, 3)
         real.append(interpreter._real)
     assert real == [MS, MS, 2 * MS, MS / 2, MS / 2, MS / 2, 9 * MS / 10]
+
+
+def test_a_message_that_the_interpreter_cannot_bear_ends_the_hearing_of_no_other_node() -> None:
+    """The thread that hears a whole bus ended without a word: every node of it was silent from then on."""
+    heard = list[str]()
+
+    def poison(_octets: bytes, _at: int) -> None:
+        raise OverflowError("int too large to convert to float")
+
+    came = [
+        [DataMessage(1, 0, b"", 0), DataMessage(2, 0, b"", 0)],
+        [DataMessage(2, 0, b"", 0)],
+    ]
+    started = threading.Event()
+    listener = SimpleNamespace(get_all=lambda _seconds: came.pop(0) if came and started.is_set() else [], lost=0)
+
+    @contextmanager
+    def listen() -> Iterator[Any]:
+        yield listener
+
+    port: Any = SimpleNamespace(place="can:x", listen=listen)
+    streams = {
+        (node, 0): SimpleNamespace(
+            queue_message=poison if node == 1 else lambda _octets, _at: heard.append("two"),
+            early=(), due=False, holds=False, flush=lambda _now: None,
+        )
+        for node in (1, 2)
+    }  # fmt: skip
+    thread = HearingThread(port)
+    with closing(thread):
+        thread._streams = cast(Any, streams)
+        started.set()
+        until(lambda: heard == ["two"])
+        until(lambda: thread.failure is None)

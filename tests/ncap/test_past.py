@@ -282,3 +282,15 @@ def test_what_waited_of_a_slow_channel_makes_no_ring_of_its_minute(rate: float, 
     past.block(block(NOW, [[float(number)] for number in range(40)], rate=rate))
     assert sum(past.channel_history(NODE, 1, NOW - 1, NOW + 40)["count"]) == 40
     assert type(past._channels[NODE, 1].minute) is kind
+
+
+def test_a_raw_integer_that_no_float_can_hold_is_a_gap_and_ends_no_history() -> None:
+    """A channel that has raw values alone may have 255 octets."""
+    past = History()
+    raw = np.empty((2, 1), dtype=object)
+    raw[:, 0] = [2**1030, 7]
+    past.learn([ChannelFacts(NODE, "arm", 1, "angle")], raw={(NODE, 1)})
+    past.block(replace(block(NOW - 2, [[np.nan], [np.nan]], rate=1.0), raw=raw))
+    history = past.channel_history(NODE, 1, NOW - 60, NOW + 60)
+    assert (history["low"], history["high"]) == ([None, 7.0], [None, 7.0])
+    assert history["segments"] == [{"id": history["segment"][0], "unit": "", "raw": True}]

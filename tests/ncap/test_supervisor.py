@@ -470,7 +470,9 @@ def test_a_measurement_is_shown_with_all_that_was_asked_and_what_its_nodes_repor
     }
     running.kept = replace(running.kept, owner="command", pid=7, started=12.5)
     shown = service.measurements._json(running)
-    assert (shown["process"], shown["nodes"]) == ({"id": 7, "started": 12.5}, []), "a command's own reports are not here"
+    assert (shown["process"], shown["nodes"]) == ({"id": 7, "started": 12.5}, []), (
+        "a command's own reports are not here"
+    )
 
 
 def test_a_node_that_left_is_shown_until_it_is_meant_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -631,9 +633,7 @@ def test_a_node_that_is_not_let_go_in_time_or_is_in_a_frozen_measurement_is_lent
     assert service.measurements.lent_for(NODE) is None
 
 
-@pytest.mark.parametrize(
-    ("seen", "stored", "asked"), [(7, 9, [9]), (7, 7, []), (7, None, []), (None, 9, [])], ids=str
-)
+@pytest.mark.parametrize(("seen", "stored", "asked"), [(7, 9, [9]), (7, 7, []), (7, None, []), (None, 9, [])], ids=str)
 def test_a_node_that_got_another_address_is_asked_there_when_it_is_returned(
     service: Service, seen: int | None, stored: int | None, asked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -680,7 +680,9 @@ def test_a_node_that_finds_no_room_waits_half_a_minute_and_says_so_once(
         waits = running.membership.waits[NODE]
         assert (waits.at, waits.room) == (130.0, 0.5)
     assert running.reports == {NODE: {"uuid": NODE, "state": "waiting", "why": "no room on the bus"}}
-    assert [(event["state"], event["uuid"], event["why"]) for event in seen] == [("waiting", NODE, "no room on the bus")]
+    assert [(event["state"], event["uuid"], event["why"]) for event in seen] == [
+        ("waiting", NODE, "no room on the bus")
+    ]
     assert running.past == set()
 
 
@@ -736,8 +738,6 @@ def test_an_expression_that_selects_only_nodes_with_a_key_and_a_datasheet_in_ser
         measurement_supervisor, "why_not_measured", lambda _station, uuid: "banned" if uuid == uuids[1] else ""
     )
     monkeypatch.setattr(service.measurements, "_is_retired", lambda uuid: uuid == uuids[2].hex())
-    monkeypatch.setattr(
-        service.station.datasheets, "datasheet", lambda uuid: None if uuid == uuids[3] else object()
-    )
+    monkeypatch.setattr(service.station.datasheets, "datasheet", lambda uuid: None if uuid == uuids[3] else object())
     monkeypatch.setattr(NodeMatch, "why_not", lambda _self, _station, uuid: "named x" if uuid == uuids[4] else "")
     assert service.measurements._selected("all") == ([uuids[0], uuids[5]], "")

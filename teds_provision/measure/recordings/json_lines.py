@@ -21,6 +21,7 @@ from teds_provision.measure.recordings.source import (
     Recording,
     channel_number,
     facts_of,
+    number_of,
     station_of,
 )
 
@@ -105,8 +106,7 @@ class JsonLines(Recording):
         if kind == "channel":
             return (self._channel(event),)
         if kind == "note":
-            at = event.get("time")
-            return Note(float(at) if isinstance(at, int | float) else 0.0, str(event.get("why"))[: MOST.text])
+            return Note(number_of(event.get("time")) or 0.0, str(event.get("why"))[: MOST.text])
         if kind == "status":
             return report_of(event)
         return None
@@ -160,7 +160,7 @@ def report_of(words: dict[str, Any]) -> NodeReport | None:
     if not isinstance(uuid, str) or state not in _STATES or len(uuid) > MOST.text:
         return None
     counts = {name: words.get(name) for name in _COUNTS}
-    error, time, reasons = words.get("clock_error"), words.get("time"), words.get("invalid_why")
+    reasons = words.get("invalid_why")
     why: list[InvalidValues] = []
     for reason in reasons[: MOST.text] if isinstance(reasons, list) else ():
         if isinstance(reason, dict) and isinstance(reason.get("channel"), int) and isinstance(reason.get("count"), int):
@@ -170,7 +170,7 @@ def report_of(words: dict[str, Any]) -> NodeReport | None:
         state,
         str(words.get("why") or "")[: MOST.text],
         **{name: value if isinstance(value, int) else 0 for name, value in counts.items()},
-        clock_error=float(error) if isinstance(error, int | float) else None,
-        time=float(time) if isinstance(time, int | float) else 0.0,
+        clock_error=number_of(words.get("clock_error")),
+        time=number_of(words.get("time")) or 0.0,
         invalid_why=tuple(why),
     )

@@ -20,7 +20,7 @@ from teds_provision.lazy import how_to_install
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, Note, StationFacts
 from teds_provision.measure.recordings.columns import Rows, Streams, raw_kind
 from teds_provision.measure.recordings.json_lines import report_of
-from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recording, facts_of, station_of
+from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recording, facts_of, number_of, station_of
 from teds_provision.measure.sinks.json_events import facts_as_json, iso, status_line
 from teds_provision.measure.sinks.text import heads_of, names_of, note_of
 from teds_provision.sanitize import printable
@@ -246,8 +246,7 @@ class ParquetRecording(Recording):
                 raise self._bad(f"its values cannot be read: {_first_line(error)}") from None
         for words in self._log:
             if isinstance(words, dict) and words.get("event") == "note":
-                at = words.get("time")
-                yield Note(float(at) if isinstance(at, int | float) else 0.0, str(words.get("why"))[: MOST.text])
+                yield Note(number_of(words.get("time")) or 0.0, str(words.get("why"))[: MOST.text])
             elif isinstance(words, dict) and (report := report_of(words)) is not None:
                 yield report
 

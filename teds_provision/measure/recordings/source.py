@@ -185,8 +185,8 @@ def _fact(name: str, value: Any, where: str) -> Any:
     """Return one fact as :class:`ChannelFacts` has it; raises BadDataError if the value is of the wrong kind."""
     if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
         return value
-    if name in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
-        return _finite(float(value), name, where)
+    if name in _NUMBERS and (number := number_of(value)) is not None:
+        return _finite(number, name, where)
     if (name in _FLAGS and isinstance(value, bool)) or (name == "kind" and value in get_args(Kind)):
         return value
     if name == "vector" and isinstance(value, list) and len(value) <= MOST.text:
@@ -201,6 +201,16 @@ def channel_number(value: object, where: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
         raise BadDataError(f"{where}: {_short(value)} is no number of a channel.")
     return value
+
+
+def number_of(value: object) -> float | None:
+    """Return a number of an untrusted recording; None if it is none, or an integer beyond the range of a float."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
 
 
 def _finite(value: float, name: str, where: str) -> float:

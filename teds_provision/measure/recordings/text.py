@@ -150,9 +150,10 @@ class TextRecording(Recording):
             for uuid, rows in by_node.items():
                 yield from streams.blocks(self._of_node(uuid, rows))
             yield ()
-        except ValueError:
+        except (ValueError, OverflowError):
             self._line = first
-            raise self._bad(f"one of the {len(lines)} rows from here on has a cell that is no number") from None
+            why = f"one of the {len(lines)} rows from here on has a cell that is no number, or too large a one"
+            raise self._bad(why) from None
 
     def _grid(self, table: list[list[str]]) -> GroupRows:
         columns = [np.fromiter(map(_number, cells), np.float64, len(table)) for cells in zip(*table, strict=True)]

@@ -7,6 +7,7 @@ reports losses (:mod:`files`). A *live* sink drops the oldest waiting block and 
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -15,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, Literal, Protocol
 
-from teds_provision.errors import NotFoundError, StoreError, TedsProvisionError
+from teds_provision.errors import InternalError, NotFoundError, StoreError, TedsProvisionError
 from teds_provision.measure.blocks import (
     Block,
     ChannelFacts,
@@ -27,6 +28,7 @@ from teds_provision.measure.blocks import (
     StationFacts,
 )
 
+_log = logging.getLogger(__name__)
 Item = Block | GroupRows | NodeReport | ClockSet | tuple[ChannelFacts, ...]
 CommandTaker = Callable[[SetPointCommand], None]
 
@@ -211,6 +213,14 @@ class ThreadedSink(ABC):
         with self._lock:
             self._tally.fail(error.message, error.hint)
 
+    def _fail_by_bug(self, bug: Exception) -> None:
+        _log.debug("Sink %s failed.", self.name, exc_info=bug)
+        self._fail(
+            InternalError(
+                f"{self.name}: unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv."
+            )
+        )
+
     def _put(self, item: Item, values: int) -> None:
         with self._lock:
             if self._closing or self._tally.state == "failed":
@@ -271,6 +281,8 @@ class ThreadedSink(ABC):
             self._fail(error)
         except OSError as error:
             self._fail(as_sink_failure(error, self.name))
+        except Exception as bug:  # noqa: BLE001  a thread that ends without a word looks like an end in order
+            self._fail_by_bug(bug)
         finally:
             self._end()
 
@@ -295,6 +307,8 @@ class ThreadedSink(ABC):
             self._fail(error)
         except OSError as error:
             self._fail(as_sink_failure(error, self.name))
+        except Exception as bug:  # noqa: BLE001  the same
+            self._fail_by_bug(bug)
         self._set_state("ended")
 
 

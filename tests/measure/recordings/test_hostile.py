@@ -43,11 +43,14 @@ def refused(path: Path, *words: str) -> None:
         (b'{"event":"channel","uuid":5}\n', ["uuid"]),
         (b'{"event":"channel","uuid":"1","number":1e9}\n', ["number of a channel"]),
         (b'{"event":"channel","uuid":"1","number":1,"low":NaN}\n', ["not finite"]),
+        (b'{"event":"channel","uuid":"1","number":1,"low":1' + 400 * b"0" + b"}\n", ["low of a channel is 1000"]),
         (b'{"event":"channel","uuid":"1","number":1,"calibration":{"method":"x"}}\n', [":1:", "calibration of"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index\n", ["columns"]),
         (b"# teds-provision measurement, text 1\n# channel: [1]\n", ["JSON object"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,3,4,5,6\n", [":3:", "6 cells"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,x,4,5\n", ["no number"]),
+        (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,9999999999999999999,4,5\n",
+         [":2:", "too large"]),
         (b"# teds-provision measurement, text 1\n\xff\xfe\n", [":2:", "UTF-8"]),
     ],
 )  # fmt: skip
@@ -55,6 +58,26 @@ def test_what_is_no_recording_is_refused_with_its_place(tmp_path: Path, octets: 
     path = tmp_path / "run"
     path.write_bytes(octets)
     refused(path, str(path), *words)
+
+
+@pytest.mark.parametrize(
+    ("line", "member", "value"),
+    [
+        ('{"event":"note","time":%s,"why":"x"}', "at", 0.0),
+        ('{"event":"status","uuid":"ab","state":"lost","time":%s}', "time", 0.0),
+        ('{"event":"status","uuid":"ab","state":"lost","clock_error":%s,"time":1}', "clock_error", None),
+    ],
+)
+def test_a_whole_number_that_no_float_can_hold_is_none(tmp_path: Path, line: str, member: str, value: object) -> None:
+    """Python reads integers of thousands of digits, and refuses to make them a float with an error of its own."""
+    path = tmp_path / "run.jsonl"
+    for number in ("1" + 400 * "0", "true", '"1"'):
+        path.write_text('{"event":"recording","station":"x"}\n' + line % number + "\n")
+        [entry] = filter(None, open_recording(path).entries())
+        assert getattr(entry, member) == value
+    path.write_text('{"event":"recording","station":"x"}\n' + line % "2" + "\n")
+    [entry] = filter(None, open_recording(path).entries())
+    assert getattr(entry, member) == 2.0
 
 
 def test_a_chunk_that_unpacks_to_gigabytes_is_refused_unopened(tmp_path: Path) -> None:

@@ -175,6 +175,35 @@ def test_a_message_of_mcap_says_what_is_not_known_or_no_measurement_and_forgets_
     assert (second.clock_error, second.value.tolist()) == (1e-4, [0.5])
 
 
+def test_an_integer_that_no_float_can_hold_is_no_number_in_mcap_and_ends_no_recording(tmp_path: Path) -> None:
+    """A sample may have 255 octets; what a node sends must not end the recording of all others."""
+    raw = np.empty((3, 1), dtype=object)
+    raw[:, 0] = [2**1030, 2**70, b"\1\2"]
+    record(tmp_path / "run.mcap", [block(raw, [[np.nan]] * 3, [[False]] * 3), block(index=3)])
+    found = [message.raw_float.tolist() for _, message, _ in samples(tmp_path / "run.mcap")][:3]
+    np.testing.assert_array_equal(found, [[np.nan], [2.0**70], [np.nan]])
+    assert len(samples(tmp_path / "run.mcap")) == 6
+
+
+@pytest.mark.parametrize("step", ["_process_item", "_idle", "_finish"])
+def test_a_bug_in_a_recorder_is_its_failure_and_no_end_in_order(
+    tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """People saw `ended` and no error, while the measurement went on and nothing was written."""
+
+    def broken(*_words: object) -> None:
+        raise OverflowError("int too large to convert to float")
+
+    sink = open_sink(str(tmp_path / "run.csv"))
+    monkeypatch.setattr(sink, step, broken)
+    sink.open([ANGLE], STATION)
+    sink.write(block())
+    if step != "_finish":
+        until(lambda: sink.stats.state == "failed")
+    sink.close()
+    assert (sink.stats.state, sink.stats.error) == ("failed", f"{sink.name}: unexpected OverflowError.")
+
+
 @given(blocks())
 @settings(max_examples=25)
 def test_every_block_comes_back_from_json_lines(data_block: Block) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from teds_provision import __version__
 from teds_provision.errors import TedsProvisionError
-from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, nearest_float
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FLUSH, FileSink
 from teds_provision.measure.sinks.json_events import facts_as_json, iso
@@ -243,10 +243,7 @@ def samples(block: Block, plain: np.ndarray) -> np.ndarray:
     raw = block.raw
     if raw.dtype.kind == "O":
         # This message has no octet strings: NaN for them, and for numbers the nearest float.
-        raw = np.array(
-            [[cell if isinstance(cell, int | float) else np.nan for cell in row] for row in raw.tolist()],
-            dtype=np.float64,
-        )
+        raw = np.array([[nearest_float(cell) for cell in row] for row in raw.tolist()], dtype=np.float64)
     times = nanoseconds(block.time)
     rows = plain.repeat(len(times))
     index = np.arange(block.index, block.index + len(times))
