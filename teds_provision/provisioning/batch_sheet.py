@@ -134,6 +134,7 @@ COLUMNS: Final = ("uuid", "name", "profile", "calibration", "item", "fingerprint
 _SHOWN: Final = 20
 _DELIMITERS: Final = ",;\t"  # if two are equally frequent, the first one counts
 _UUID = re.compile("[0-9a-f]{20}")
+_LEAST_DIGITS: Final = 32
 _FINGERPRINT = re.compile("[0-9a-f]{32,64}")
 
 
@@ -230,7 +231,9 @@ class _SheetReader:
         self._prepared: dict[BuildOrder, PreparedOrder | str] = {}
 
     def wrong(self, line: int, why: str) -> None:
-        self.mistakes.setdefault(why, []).append(line)
+        lines = self.mistakes.setdefault(why, [])
+        if lines[-1:] != [line]:
+            lines.append(line)
         self.count += 1
 
     def read(self, octets: bytes) -> None:
@@ -273,7 +276,9 @@ class _SheetReader:
         uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID, "20 hex digits")
         pin = self._digits(line, "fingerprint", values.get("fingerprint", ""), _FINGERPRINT, "32 to 64 hex digits")
         prepared = self._order(line, values)
-        for what, value in (("uuid", uuid), ("fingerprint", pin), ("name", values.get("name", ""))):
+        # the first 32 digits are a key's: a row may have more of them than another one
+        short = pin[:_LEAST_DIGITS] if pin is not None else ""
+        for what, value in (("uuid", uuid), ("fingerprint", short), ("name", values.get("name", ""))):
             self._once(line, what, value or "")
         if uuid is not None and prepared is not None and prepared.order.name is not None:
             name = prepared.order.name

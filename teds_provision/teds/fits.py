@@ -220,9 +220,9 @@ def _meets(term: Term, has: float, channel: Channel) -> bool:
         case "<=":
             return has <= asked + slack
         case ">":
-            return has > asked
+            return has > asked + slack
         case _:
-            return has < asked
+            return has < asked - slack
 
 
 def _every_angle(channel: Channel) -> bool:

@@ -322,6 +322,11 @@ def test_what_a_trace_gets_of_a_sealed_command_and_its_reply(board: Board) -> No
     assert noted[0][3] == IDENTIFY.encode()
     assert noted[1][3] == Reply(True, payload=plain).encode()
     noted.clear()
+    link.script = [refusal(Reason.WRONG_STATE)]
+    with pytest.raises(SessionLostError):
+        node.request(IDENTIFY, "x")
+    assert [(way, sealed) for way, _, sealed, _ in noted] == [("out", True), ("in", False)], "a refusal in plain"
+    noted.clear()
     node.forget()
     node.request(IDENTIFY, "x")
     assert [(way, sealed, opened) for way, _, sealed, opened in noted] == [("out", False, None), ("in", False, None)]

@@ -14,19 +14,26 @@ from teds_provision.errors import (
     NodeBusyError,
     NodeSilentError,
     NoNodeError,
+    NotAuthenticError,
+    NotFoundError,
     PolicyError,
+    TedsProvisionError,
+    UsageError,
     VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.provisioning.batch import BatchRun, ProvisionRequest
 from teds_provision.provisioning.batch_sheet import (
     BatchSheet,
+    BatchTotals,
     BoardResult,
     DeclinedError,
     Progress,
     ReportHead,
     SheetRow,
+    check_report,
     read_sheet,
+    worse,
     write_report,
 )
 from teds_provision.provisioning.build import BuildOrder
@@ -351,3 +358,162 @@ class SixAtOnce:
 
 def on_reader_number(number: int) -> Contact:
     return contact(Board(uuid=board_of(number + 1)))
+
+
+LABEL_KEY = "ab" * 32
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("uuid,nam\n", "boards.csv:1: there is no column 'nam'; columns are uuid, name, profile, calibration, item,"),
+        ("name,NAME\na,b\n", "boards.csv:1: the column 'name' appears twice."),
+        ("name\na,b\n", "boards.csv:2: 2 cells under 1 columns."),
+        ("uuid\n8d4d\n", "boards.csv:2: uuid: expected 20 hex digits, not '8d4d'."),
+        (f"fingerprint\n{'ab' * 15}\n", f"boards.csv:2: fingerprint: expected 32 to 64 hex digits, not '{'ab' * 15}'."),
+        (f"fingerprint\n{'ab' * 33}\n", f"boards.csv:2: fingerprint: expected 32 to 64 hex digits, not '{'ab' * 24}'."),
+        ("name\na\n\nb\na\n", "boards.csv:5: the name a is already in line 2."),
+        (
+            "uuid\n8d4d9da65281f7000000\n0x8D4D-9da6 5281f7000000\n",
+            "boards.csv:3: the uuid 8d4d9da65281f7000000 is already",
+        ),
+        (
+            f"fingerprint\n{'ab' * 32}\n{'ab' * 16}\n",
+            f"boards.csv:3: the fingerprint {'ab' * 16} is already in line 2.",
+        ),
+        ('name\n"a', "boards.csv:2: this is not CSV: unexpected end of data."),
+        ("name\n" + "x\n" * 3 + "y\n", "boards.csv:3, 4: the name x is already in line 2."),
+        ("profile\nnone\n", "boards.csv:2: There is no profile"),
+        ("uuid\n" + "".join(f"{n}\n" for n in range(22)), "; and 2 more."),
+    ],
+)
+def test_each_mistake_in_a_sheet_is_named_with_its_line(
+    station: Station, tmp_path: Path, text: str, message: str
+) -> None:
+    with pytest.raises(BadDataError) as caught:
+        read(station, tmp_path, text)
+    assert caught.value.message.startswith(message) or (message[0] == ";" and caught.value.message.endswith(message))
+    assert caught.value.hint == "Nothing was provisioned. Fix the sheet and run the same command again."
+
+
+def test_a_sheet_without_rows_says_what_it_needs(station: Station, tmp_path: Path) -> None:
+    for text in ("", "uuid,name\n", "uuid,name\n ,\n"):
+        with pytest.raises(BadDataError, match=r"boards\.csv has no rows") as caught:
+            read(station, tmp_path, text)
+        assert caught.value.hint == (
+            "It needs a header (uuid, name, profile, calibration, item, fingerprint) and one line per board."
+        )
+
+
+def test_a_row_is_for_the_board_that_it_names_and_gets_what_the_sheet_leaves_out(
+    station: Station, tmp_path: Path
+) -> None:
+    file = tmp_path / "boards.csv"
+    file.write_text(
+        "uuid,name,profile,item,fingerprint\n8d4d9da65281f7000000,a,,,\n\n"
+        f",,gripper,i1,{'ab' * 20}\n,b-{{n}},,,\n,b-{{n}},,,\n"
+    )
+    first, second, third, fourth = read_sheet(
+        station, file, BuildOrder(profile="load-cell", name="common", item="i0")
+    ).rows
+    assert [(row.number, row.line) for row in (first, second, third)] == [(1, 2), (2, 4), (3, 5)]
+    orders = [
+        (row.prepared.order.profile, row.prepared.order.name, row.prepared.order.item) for row in (first, second, third)
+    ]
+    assert orders == [("load-cell", "a", "i0"), ("gripper", "common", "i1"), ("load-cell", "b-{n}", "i0")]
+    assert [row.by_order for row in (first, second, third, fourth)] == [False, False, True, True]
+    named = bytes.fromhex("8d4d9da65281f7000000")
+    assert first.means(named, "cd" * 32), "another key is for the pin to refuse"
+    assert not first.means(bytes(10), "ab" * 32)
+    assert second.means(bytes(10), "ab" * 32)
+    assert not second.means(bytes(10), "ab" * 19 + "cd" * 13)
+    assert not third.means(bytes(10), "ab" * 32)
+    assert third.digest == fourth.digest != first.digest
+    assert set(first.content) == {"profile", "calibration", "name"}
+    assert first.content["name"] == "a"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "first"),
+    [
+        (NodeSilentError("a"), PolicyError("b"), "b"),
+        (PolicyError("a"), NotAuthenticError("b"), "b"),
+        (NotAuthenticError("a"), PolicyError("b"), "a"),
+        (DeclinedError("a"), NodeSilentError("b"), "a"),
+        (PolicyError("a"), DeclinedError("b"), "a"),
+        (DeclinedError("a"), PolicyError("b"), "b"),
+        (None, NodeSilentError("b"), "b"),
+        (NodeSilentError("a"), None, "a"),
+    ],
+)
+def test_which_error_of_a_batch_a_person_should_see(
+    one: TedsProvisionError | None, other: TedsProvisionError | None, first: str
+) -> None:
+    found = worse(one, other)
+    assert found is not None
+    assert found.message == first
+
+
+def test_a_batch_ends_with_its_worst_error_and_its_counts() -> None:
+    def totals(passed: int, failed: int, skipped: int, error: TedsProvisionError | None) -> TedsProvisionError | None:
+        return BatchTotals(passed, failed, skipped, 1.0, None, {}, error).error
+
+    assert totals(2, 0, 0, None) is None
+    for failed, skipped in ((1, 0), (0, 1)):
+        ended = totals(2, failed, skipped, None)
+        assert type(ended) is PolicyError
+        assert ended.message == f"2 passed, {failed} failed, {skipped} skipped."
+        assert ended.hint == "Run the same command again to continue with the rest."
+    assert isinstance(totals(0, 1, 0, NotAuthenticError("x")), NotAuthenticError)
+    assert isinstance(totals(0, 1, 0, NodeSilentError("x")), NodeSilentError)
+
+
+def test_a_whole_report_for_programs(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "uuid,name\n8d4d9da65281f7000000,=SUM(A1)\n,b\n,c\n"))
+    first, second, _ = progress.sheet.rows
+    progress.note(first, BoardResult(board_of(1), 1.23456, row=1, time="2026-11-28T01:02:03Z"))
+    progress.assign_row(second, board_of(2))
+    silent = BoardResult(
+        board_of(2), 2.0, error=NodeSilentError('Gone, and "lost".'), row=2, time="2026-11-28T01:02:04Z"
+    )
+    progress.note(second, silent)
+    progress.note(second, silent)
+    progress.rows[1].steps = {"write": 0.25, "verify": 0.5}
+    check_report(tmp_path / "day.CSV")
+    write_report(tmp_path / "day.CSV", progress, ReportHead("s", "f", "o", "w"))
+    assert (
+        (tmp_path / "day.CSV").read_text()
+        == f"""\
+row,uuid,name,profile,result,tries,first_pass,seconds,time,message
+1,8d4d9da65281f7000000,'=SUM(A1),load-cell,passed,1,true,1.235,2026-11-28T01:02:03Z,
+2,{board_of(2).hex()},b,load-cell,failed,2,false,2.0,2026-11-28T01:02:04Z,"Gone, and ""lost""."
+3,,c,load-cell,not reached,0,false,0.0,,
+
+passed,1
+failed,1
+skipped,1
+seconds,3.235
+first_pass,0.5000
+seconds of write,0.2500
+seconds of verify,0.5000
+"""
+    )
+    with pytest.raises(UsageError, match=r"day\.pdf is neither CSV nor HTML"):
+        check_report(tmp_path / "day.pdf")
+    with pytest.raises(NotFoundError, match=r"There is no folder .*none for the report"):
+        check_report(tmp_path / "none" / "day.html")
+    check_report(None)
+
+
+def test_a_board_that_was_declined_in_the_end_counts_as_none_that_was_tried(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
+    first, second = progress.sheet.rows
+    progress.note(first, BoardResult(board_of(1), 1.0, error=PolicyError("refused"), row=1))
+    progress.note(first, BoardResult(board_of(1), 1.0, error=DeclinedError("no"), row=1))
+    assert (progress.totals().first_pass, progress.totals().skipped) == (None, 2)
+    progress.note(second, BoardResult(board_of(2), 1.0, row=2))
+    totals = progress.totals()
+    assert (totals.first_pass, totals.passed, totals.failed, totals.skipped) == (1.0, 1, 0, 1)
+    assert isinstance(totals.error, PolicyError), "the worst of all boards, not the last one's"
+    assert totals.worst is not None
+    assert totals.worst.message == "refused"

@@ -11,15 +11,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, PolicyError
+from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, PolicyError, UsageError
 from teds_provision.provisioning.whitelist import (
     FORMATS,
     ListedNode,
     add,
+    form_of,
+    named,
     plan_addition,
     read_whitelist,
     remove,
     render,
+    require_name,
 )
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
@@ -293,3 +296,152 @@ def test_an_eui_64_gets_the_uuid_of_the_written_rule_in_every_format(tmp_path: P
         (tmp_path / "wrong.csv").write_text(f"uuid\n{wrong}\n")
         with pytest.raises(BadDataError, match="20 hex digits"):
             read_whitelist(tmp_path / "wrong.csv")
+
+
+SHOWN = (
+    WhitelistEntry(ONE, KEY, "2026-11-28T01:02:03Z", "tap", 'a "b" <&>'),
+    WhitelistEntry(TWO, None, "2026-11-28T01:02:04Z", "uuid", None),
+)
+
+
+@pytest.mark.parametrize(
+    ("form", "text"),
+    [
+        (
+            "xml",
+            '<?xml version="1.0" encoding="UTF-8"?>\n<whitelist>\n'
+            f'  <transducer uuid="0x8d4d9da65281f7000000" fingerprint="{KEY}" added="2026-11-28T01:02:03Z"'
+            ' assurance="tap"'
+            ' name="a &quot;b&quot; &lt;&amp;&gt;"/>\n'
+            '  <transducer uuid="0x8d4d9da65281f7000001" added="2026-11-28T01:02:04Z" assurance="uuid"/>\n'
+            "</whitelist>\n",
+        ),
+        (
+            "csv",
+            "uuid,fingerprint,added,assurance,name\n"
+            f'8d4d9da65281f7000000,{KEY},2026-11-28T01:02:03Z,tap,"a ""b"" <&>"\n'
+            "8d4d9da65281f7000001,,2026-11-28T01:02:04Z,uuid,\n",
+        ),
+        (
+            "json",
+            f"""{{
+ "whitelist": [
+  {{
+   "uuid": "8d4d9da65281f7000000",
+   "fingerprint": "{KEY}",
+   "added": "2026-11-28T01:02:03Z",
+   "assurance": "tap",
+   "name": "a \\"b\\" <&>"
+  }},
+  {{
+   "uuid": "8d4d9da65281f7000001",
+   "fingerprint": null,
+   "added": "2026-11-28T01:02:04Z",
+   "assurance": "uuid",
+   "name": null
+  }}
+ ]
+}}
+""",
+        ),
+    ],
+)
+def test_a_whole_whitelist_in_each_form(form: str, text: str) -> None:
+    assert "".join(render(SHOWN, form)) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "expected"),
+    [("a.CSV", None, "csv"), ("a.json", "xml", "xml"), ("a", None, "xml"), ("-", None, "xml"), ("a.txt", "csv", "csv")],
+)
+def test_the_form_to_write_follows_the_option_then_the_name(name: str, form: str | None, expected: str) -> None:
+    assert form_of(Path(name), form) == expected
+
+
+def test_a_name_that_tells_no_form_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"^Cannot tell the format from the name a\.txt\.$"):
+        form_of(Path("a.txt"), None)
+
+
+def test_the_form_to_read_follows_the_option_then_the_name_then_the_content(tmp_path: Path) -> None:
+    (tmp_path / "a.xml").write_text(f"{ONE.hex()}\n")
+    assert pairs(read_whitelist(tmp_path / "a.xml", "csv")) == [(ONE, None)]
+    with pytest.raises(BadDataError, match="this is not XML"):
+        read_whitelist(tmp_path / "a.xml")
+    with pytest.raises(BadDataError, match=r"list\.txt is empty"):
+        read(tmp_path, " \n")
+
+
+def test_of_two_digits_of_one_key_the_longer_one_is_kept(station: Station) -> None:
+    put(station, ListedNode(1, ONE, KEY[:32]))
+    assert plan_addition(station, [ListedNode(1, ONE, KEY[:32])]).unchanged == 1
+    plan = plan_addition(station, [ListedNode(1, ONE, KEY), ListedNode(2, TWO)])
+    assert (plan.new, plan.unchanged, [entry.fingerprint for entry in plan.write]) == (1, 0, [KEY, None])
+    add(station, plan, source="list.csv")
+    assert plan_addition(station, [ListedNode(1, ONE, KEY[:40])]).write == (), "the shorter one adds nothing"
+    entry = station.pins.entry(ONE)
+    assert entry is not None
+    assert (entry.fingerprint, entry.assurance) == (KEY, "import")
+    other = station.pins.entry(TWO)
+    assert other is not None
+    assert other.assurance == "uuid"
+
+
+def test_what_an_addition_and_a_removal_leave_in_the_log(station: Station) -> None:
+    add(station, plan_addition(station, [ListedNode(1, ONE, KEY), ListedNode(2, TWO)]), source="list.csv")
+    add(station, plan_addition(station, [ListedNode(1, ONE, KEY)]), source="list.csv")  # nothing to add
+    third = bytes(9) + b"\3"
+    add(station, plan_addition(station, [ListedNode(0, third)]))
+    assert remove(station, ONE)
+    station.nodes.remember(bytes(9) + b"\4", point=station.point)
+    assert remove(station, bytes(9) + b"\4")
+    assert not remove(station, bytes(9) + b"\5")
+    log = [
+        (line.uuid, line.outcome, dict(line.detail)) for line in station.audit_log.entries() if line.act == "whitelist"
+    ]
+    assert log == [
+        (None, "imported", {"file": "list.csv", "entries": 2, "new": 2}),
+        (third, "added", {"fingerprint": None, "assurance": "uuid"}),
+        (ONE, "removed", {}),
+        (bytes(9) + b"\4", "unpinned", {}),
+    ]
+
+
+def test_of_many_refused_nodes_the_first_five_are_named(station: Station) -> None:
+    uuids = [bytes([number]) * 10 for number in range(1, 8)]
+    listed = [ListedNode(1, uuid, KEY) for uuid in uuids]
+    add(station, plan_addition(station, listed), source="x")
+    with pytest.raises(KeyMismatchError) as mismatch:
+        plan_addition(station, [ListedNode(1, uuid, OTHER) for uuid in uuids])
+    message = mismatch.value.message
+    assert message.startswith(
+        f"{uuids[0].hex()} is pinned to the key {KEY[:32]}, not {OTHER[:32]}; {uuids[1].hex()} is"
+    )
+    assert message.endswith(f"{uuids[4].hex()} is pinned to the key {KEY[:32]}, not {OTHER[:32]} and 2 more.")
+    assert mismatch.value.hint.endswith(f"teds-provision whitelist remove {uuids[0].hex()}")
+    for uuid in uuids[:5]:
+        station.policy.deny(RevocationRecord(uuid, None, "lost", "{}"))
+    with pytest.raises(PolicyError) as refused:
+        plan_addition(station, listed)
+    shown = ", ".join(f"{uuid.hex()} (lost)" for uuid in uuids[:5])
+    assert refused.value.message == f"Revoked nodes cannot be whitelisted: {shown}."
+
+
+@pytest.mark.parametrize(("name", "good"), [("a" * 200, True), ("a" * 201, False), ("a\tb", False), ("", True)])
+def test_a_name_of_a_list_is_printable_and_has_at_most_200_letters(tmp_path: Path, name: str, good: bool) -> None:
+    text = json.dumps([{"uuid": ONE.hex(), "name": name}])
+    if good:
+        assert [entry.name for entry in read(tmp_path, text)] == [name or None]
+        require_name(name)
+        return
+    with pytest.raises(BadDataError, match=r":1: name: a name is printable and has at most 200 characters\.$"):
+        read(tmp_path, text)
+    with pytest.raises(BadDataError, match=r"^A name is printable and has at most 200 characters\.$"):
+        require_name(name)
+
+
+def test_a_node_without_a_name_of_its_own_in_the_list_is_shown_by_its_datasheet(station: Station) -> None:
+    station.nodes.remember(ONE, name="own")
+    station.nodes.remember(TWO, name="own 2")
+    listed = (WhitelistEntry(ONE), WhitelistEntry(TWO, name="listed"), WhitelistEntry(bytes(10)))
+    assert [entry.name for entry in named(station, listed)] == ["own", "listed", None]

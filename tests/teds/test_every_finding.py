@@ -447,6 +447,37 @@ error not-canonical @- - <the canonical form|>
 """,
     ),
     (
+        "a maker's field twice",
+        framed(META, "800100", "800100"),
+        """\
+clean 2007 1
+note manufacturer @38 - <|128>
+    The field 128 is in the manufacturers' range.
+note manufacturer @41 - <|128>
+    The field 128 is in the manufacturers' range.
+""",
+    ),
+    (
+        "the last class of 2024",
+        framed("0305 0000 110201"),
+        """\
+clean 2024 17
+note unverified @- - <|>
+    The field numbers of TimeSyncTEDS are not checked against the standard.
+""",
+    ),
+    (
+        "the first class that nobody has",
+        framed("0305 0000 120201"),
+        """\
+clean 2024 18
+note class @4 TEDSID <|18>
+    The class 18 is reserved.
+note unverified @- - <|>
+    The field numbers of reserved 18 are not checked against the standard.
+""",
+    ),
+    (
         "text in a tuple",
         framed("0304 0004 0101", TEXT_HEAD, "800161"),
         """\

@@ -170,3 +170,131 @@ def test_a_sheet_of_requirements_that_means_nothing_names_the_place(text: str, w
         parse_require(text, "task.toml")
     assert words in caught.value.message
     assert caught.value.message.startswith("task.toml")
+
+
+def test_every_quantity_has_the_unit_of_its_kind() -> None:
+    known = {
+        "angle": "rad",
+        "angular-velocity": "rad/s",
+        "angular-rate": "rad/s",
+        "angular-acceleration": "rad/s²",
+        "length": "m",
+        "distance": "m",
+        "position": "m",
+        "displacement": "m",
+        "area": "m²",
+        "volume": "m³",
+        "velocity": "m/s",
+        "speed": "m/s",
+        "acceleration": "m/s²",
+        "flow": "m³/s",
+        "mass": "kg",
+        "density": "kg/m³",
+        "time": "s",
+        "frequency": "Hz",
+        "current": "A",
+        "temperature": "K",
+        "force": "N",
+        "torque": "N·m",
+        "moment": "N·m",
+        "energy": "J",
+        "stiffness": "N/m",
+        "pressure": "Pa",
+        "power": "W",
+        "voltage": "V",
+        "resistance": "Ω",
+        "capacitance": "F",
+        "inductance": "H",
+        "magnetic-field": "T",
+        "charge": "C",
+        "illuminance": "lx",
+    }
+    for quantity, unit in known.items():
+        (term,) = parse_fits(f"{quantity.replace('-', ' ').upper()} >= 2 {unit}").terms
+        assert (term.what, term.value) == (quantity, 2.0)
+        with pytest.raises(BadDataError, match="does not measure this"):
+            parse_fits(f"{quantity} >= 2 mol")
+    with pytest.raises(BadDataError, match="no quantity that is known"):
+        parse_fits("luck >= 2")
+
+
+@pytest.mark.parametrize(
+    ("text", "result", "why"),
+    [
+        ("range > 359 deg", "passed", "range 360 °."),
+        ("range > 360 deg", "failed", "range is 360 °, asked is > 360 deg."),
+        ("range >= 360 deg", "passed", "range 360 °."),
+        ("range < 360 deg", "failed", "range is 360 °, asked is < 360 deg."),
+        ("range < 361 deg", "passed", "range 360 °."),
+        ("uncertainty < 1 deg", "failed", "uncertainty is 1 °, asked is < 1 deg."),
+        ("uncertainty <= 1 deg", "passed", "uncertainty 1 °."),
+        ("uncertainty <= 0.2 %", "failed", "uncertainty is 0.278 %, asked is <= 0.2 %."),
+        ("rate >= 10 kHz, range >= 1 rad", "passed", "rate 10000 Hz, range 360 °."),
+        (
+            "rate > 10001 Hz, range >= 7 rad",
+            "failed",
+            "rate is 10000 Hz, asked is > 10001 Hz; range is 360 °, asked is >= 7 rad.",
+        ),
+        ("low >= 0 deg, high <= 360 deg", "passed", "low 0 °, high 360 °."),
+        ("low > 0 deg", "failed", "low is 0 °, asked is > 0 deg."),
+        ("high < 360 deg", "failed", "high is 360 °, asked is < 360 deg."),
+        ("angle <= 0 deg, angle >= 360 deg", "passed", "angle 0 °, angle 360 °."),
+        ("angle > 400 deg", "passed", "angle 360 °."),
+        ("angle < -1 deg", "failed", "angle is 0 °, asked is < -1 deg."),
+        ("force >= 1 N", "failed", "no channel gives force."),
+    ],
+)
+def test_a_result_in_whole_words(text: str, result: str, why: str) -> None:
+    sheet = angle()
+    known = replace(sheet.channels[0], timing=replace(sheet.channels[0].timing, period=1e-4))
+    found = only(text, replace(sheet, channels=(known,)))
+    assert (found.result, found.why) == (result, why)
+
+
+def test_what_is_not_stated_is_skipped_unless_something_else_is_short() -> None:
+    bare = angle(low=math.nan, uncertainty=math.nan, calibration=None, units=parse_unit("m").units, sample=None)
+    found = only("range >= 1 m, uncertainty <= 1 mm", bare)
+    assert found.result == "failed"
+    assert found.why == (
+        "The datasheet does not say how a sample of channel 1 is coded; range is not stated; uncertainty is not stated."
+    )
+    silent = angle(low=math.nan)
+    assert only("range >= 1 deg, low <= 0 deg, angle >= 360 deg", silent) == Fit(
+        1, "angle", "skipped", "range is not stated; low is not stated."
+    )
+    assert only("rate >= 1 Hz", angle(timing=replace(angle().channels[0].timing, period=0.0))).result == "skipped"
+    late = datetime(2027, 1, 2, tzinfo=UTC)
+    assert only("angle >= 360 deg", angle(), late).result == "passed", "only an uncertainty ends with its calibration"
+
+
+def test_which_channels_count_and_how_many_have_to_meet_it() -> None:
+    asked = parse_fits("rate >= 1 Hz")
+    good, bad = Fit(1, "a", "passed", ""), Fit(2, "b", "failed", "")
+    assert [met(asked, fits) for fits in ([], [good, bad], [bad], [Fit(None, "", "passed", "")])] == [
+        False,
+        True,
+        False,
+        False,
+    ]
+    named = replace(asked, channel="a")
+    assert [met(named, fits) for fits in ([good, bad], [good, good], [])] == [False, True, False]
+    assert (asked.subject, named.subject, replace(asked, quantity="force").subject) == (
+        "a channel",
+        'the channel "a"',
+        "force",
+    )
+
+
+def test_a_table_of_requirements_in_its_defaults() -> None:
+    text = '[force]\nlow = "-1 N"\nhigh = "5 N"\nrange = "6 N"\nuncertainty = "< 1 %"\nforce = "2 N"\nrate = "2 Hz"\n'
+    (asked,) = parse_require(text, "task.toml")
+    assert [term.text for term in asked.terms] == [
+        "low <= -1 N",
+        "high >= 5 N",
+        "range >= 6 N",
+        "uncertainty < 1 %",
+        "force >= 2 N",
+        "rate >= 2 Hz",
+    ]
+    with pytest.raises(BadDataError, match=r"^task\.toml: \[Joint 3\]: there is no bound \"force\"\.$"):
+        parse_require('["Joint 3"]\nforce = "1 N"\n', "task.toml")

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.calibration import fit
+from teds_provision.teds.formats import TedsBlock
 from teds_provision.teds.profile import (
     Profile,
     check,
@@ -28,7 +29,9 @@ from teds_provision.teds.profile import (
     shipped_profiles,
     template,
 )
+from teds_provision.teds.profile.model import CalibrationDemand
 from teds_provision.teds.profile.reader import key_lines
+from teds_provision.teds.show import describe
 from teds_provision.teds.units import parse_unit
 
 UUID = bytes.fromhex("81c0f9744881f5622e78")
@@ -453,3 +456,230 @@ def test_a_file_in_the_working_folder_never_stands_in_for_a_shipped_type(
     assert message.startswith("profiles/load-cell.toml was not used: load-cell is ")
     assert passed_over("mine", folders) == ()
     assert passed_over("profiles/load-cell.toml", folders) == ()
+
+
+RICH = """\
+title = "Rich"
+name = "rich board"
+description = " all of it "
+links = ["can", "nfc"]
+
+[meta]
+operation-timeout = "100 ms"
+slow-timeout = 2
+self-test-time = "1 min"
+[[meta.control-group]]
+type = 1
+members = [1, 2]
+[[meta.vector-group]]
+type = 3
+members = [2, 3]
+[[meta.geo-location]]
+location = 4
+type = 5
+members = [1]
+[[meta.proxy]]
+channel = 3
+organization = 6
+members = [1, 2]
+
+[channel.all]
+type = "sensor"
+unit = "degC"
+low-limit = -40
+high-limit = "100 degC"
+uncertainty = "0.9 degF"
+update-time = "1 ms"
+write-setup-time = "2 us"
+read-setup-time = "50 us"
+sampling-period = "1 kHz"
+warm-up-time = "2 min"
+read-delay-time = "3 ms"
+self-test-time = "1 s"
+sample = { model = "fraction", octets = 2, bits = 12 }
+sampling = { modes = ["immediate", "trigger"] }
+[channel.1-2]
+name = "t{channel}"
+[channel.2]
+type = "event-sensor"
+self-test = true
+multi-range = true
+time-source = 7
+incoming-delay = "1 us"
+outgoing-delay = "2 us"
+trigger-uncertainty = "3 us"
+transmission = "buffer-or-interval"
+buffered = 8
+end-of-set = 9
+edge-report = "selectable-both"
+direction = "90 degree"
+direction-angles = ["0 degree", "180 degree"]
+event-options = "changeable-checked"
+calibration-key = "tim-self"
+sampling = { modes = ["continuous", "free-running", "free-running-pre-trigger"], default = "free-running" }
+[channel.2.data-set]
+repeats = 10
+origin = 20
+step = 1.8
+unit = "degF"
+pre-trigger = 3
+[channel.3]
+name = "valve"
+type = "actuator"
+actuator-halt = "ramp"
+frame = "{node}_valve{channel}"
+display-unit = "degF"
+[channel.3.calibration]
+required = true
+method = "polynomial"
+degree = 3
+monotone = true
+interval = "1 year"
+raw-range = [0, 4095]
+standard-deviation = 0.5
+zero-offset = true
+indication = [0.5, -40]
+[[text]]
+kind = "title"
+xml = "<a/>"
+language = "de"
+[phy]
+radio = "bluetooth"
+bit-rate = 1000000
+encryption = 0x0110
+authentication = true
+battery = false
+retries = 2
+"""
+
+
+def words_of(blocks: dict[tuple[int, int], bytes]) -> dict[tuple[int, int], str]:
+    """Return each TEDS as its fields in words, in their order."""
+    found = {}
+    for place, octets in blocks.items():
+        pending, out = list(describe(TedsBlock(*place, octets), blocks).fields), []
+        while pending:
+            field = pending.pop(0)
+            pending = [*field.children, *pending]
+            out.append(f"{field.name} {field.meaning or field.text}".strip())
+        found[place] = "; ".join(out[1:])  # without the TEDSID
+    return found
+
+
+TIMES = "UpdateT 1 ms; WSetupT 2 µs; RSetupT 50 µs; SPeriod 1 ms; WarmUpT 120 s; RDelayT 3 ms; TestTime 1 s; "
+KELVINS = "PhyUnits K; LowLimit -40 °C; HiLimit 100 °C; OError 0.5 °C; "
+SAMPLE = "Sample; DatModel fraction; ModLenth 2; SigBits 12; "
+
+
+def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) -> None:
+    profile = load_profile(write(tmp_path, "rich", RICH))
+    assert (profile.title, profile.tim_name, profile.description) == ("Rich", "rich board", "all of it")
+    assert (profile.links, profile.warnings, profile.abstract) == (("can", "nfc"), (), False)
+    built = profile.build(bytes(range(10)))
+    assert built.warnings == (
+        "Channel 3 (valve) has no calibration, and its type asks for one: give it with --calibration FILE.",
+    )
+    assert words_of(built.blocks) == {
+        (0, 1): "UUID 00010203040506070809; OholdOff 100 ms; SHoldOff 2 s; TestTime 60 s; MaxChan 3; "
+        "CGroup; GrpType 1; MemList 1, 2; VGroup; GrpType 3; MemList 2, 3; GeoLoc; GrpType 5; MemList 1; LocEnum 4; "
+        "Proxies; MemList 1, 2; ChanNum 3; Organiz 6",
+        (0, 11): "NumLang 1; DirBlock; LangCode de; Offset 38; Length 6; Compress 0; SubSum 65131",
+        (0, 12): "Format user defined; TCName rich board",
+        (0, 13): "Radio Bluetooth; MaxBPS 1000000 bit/s; Encrypt 272; Authent 1; Battery 0; MaxRetry 2",
+        (1, 3): f"CalKey CAL_NONE; ChanType sensor; {KELVINS}SelfTest none; {SAMPLE}{TIMES}"
+        "Sampling; SampMode trigger, immediate; SDefault 16",
+        (1, 12): "Format user defined; TCName t1",
+        (2, 3): f"CalKey TIM_CAL_SELF; ChanType event sensor; {KELVINS}SelfTest provided; MRange 1; {SAMPLE}"
+        f"DataSet; Repeats 10; SOrigin -6.66666 °C; StepSize 1 °C; SUnits K; PreTrigg 3; {TIMES}"
+        "TimeSrc 7; InPropDl 1 µs; OutPropD 2 µs; TSError 3 µs; "
+        "Sampling; SampMode free-running, free-running with pre-trigger, continuous; SDefault 2; "
+        "DataXmit buffer or interval; Buffered 8; EndOfSet 9; EdgeRpt selectable, default both; "
+        "Directon 1.570796; DAngles 0, 3.141593; ESOption changeable, inconsistencies detected",
+        (2, 12): "Format user defined; TCName t2",
+        (3, 3): f"CalKey CAL_NONE; ChanType actuator; {KELVINS}SelfTest none; {SAMPLE}{TIMES}"
+        "Sampling; SampMode trigger, immediate; SDefault 16; ActHalt ramp",
+        (3, 12): "Format user defined; TCName valve",
+    }
+    assert [
+        (channel.number, channel.calibration_key, channel.display, channel.frame) for channel in profile.channels
+    ] == [
+        (1, None, None, ""),
+        (2, 5, None, ""),
+        (3, None, "degF", "{node}_valve3"),
+    ]
+    assert profile.channels[0].calibration == CalibrationDemand()
+    assert profile.channels[2].calibration == CalibrationDemand(
+        required=True,
+        method="polynomial",
+        degree=3,
+        monotone="either",
+        interval=31556952.0,
+        raw_range=(0.0, 4095.0),
+        zero_offset=True,
+        standard_deviation=0.5,
+        indication=(0.5, -40.0),
+    )
+    assert profile.channels[2].calibration.indication == (0.5, -40.0)
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (
+            "[channel.1.calibration]\nmonotone = 'up'\n",
+            'channel.1.calibration.monotone: "increasing", "decreasing", true',
+        ),
+        (
+            "[channel.1.calibration]\nraw-range = [5, 5]\n",
+            "channel.1.calibration.raw-range: two numbers, the lower one",
+        ),
+        ("[channel.1.calibration]\nraw-range = [0, true]\n", "channel.1.calibration.raw-range: two numbers, the lower"),
+        ("[channel.1.calibration]\nindication = [0, 1]\n", "channel.1.calibration.indication: slope and intercept are"),
+        ("[channel.1.calibration]\nindication = [1, 2, 3]\n", "channel.1.calibration.indication: slope and intercept"),
+        ("[channel.1.calibration]\ninterval = 0\n", "channel.1.calibration.interval: 0 is not a time that a TEDS can"),
+        (
+            "[channel.1.calibration]\ninterval = 4294967296\n",
+            "channel.1.calibration.interval: 4294967296 is not a time",
+        ),
+        ("[channel.1.calibration]\nmethod = 'cubic'\n", 'channel.1.calibration.method: "cubic" is no method; linear, '),
+        ("[channel.1.calibration]\nrequired = 1\n", "channel.1.calibration.required: "),
+        (
+            "[channel.1-1]\ncalibration-key = 'none'\n[channel.1.calibration]\nrequired = true\n",
+            'channel.1-1.calibration-key: "none" contradicts calibration.required = true.',
+        ),
+        ("[channel.1-1]\nframe = '9x'\n", "channel.1-1.frame: letters, digits, _ and / are expected, and {node}"),
+        (
+            "[channel.1-1]\ndisplay-unit = 'mm'\n",
+            'channel.1-1.display-unit: "mm" is not of the same kind as the channel\'s',
+        ),
+        ("[channel.1-1]\ndisplay-unit = 'qq'\n", 'channel.1-1.display-unit: "qq" is not a unit'),
+        ("[channel.3]\nunit = 'N'\n", "channel: channels are numbered from 1 without gaps; 2 is missing."),
+        ("[channel.2-1]\nunit = 'N'\n", "channel.2-1: channel numbers go from 1 to 255, the lower one first."),
+        ("[channel.1-256]\nunit = 'N'\n", "channel.1-256: channel numbers go from 1 to 255, the lower one first."),
+        ("[[text]]\nkind = 'title'\n", "text[0].xml: the text is missing."),
+        (
+            "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'deu'\n",
+            "text[0].language: a language has two letters, like",
+        ),
+        ("[[text]]\nkind = 'title'\nxml = 'x'\nchannel = 2\n", "text[0].channel: the type has no channel 2."),
+        (
+            "[[meta.proxy]]\nchannel = 1\norganization = 1\nmembers = [1, 2, 3]\n",
+            "meta.proxy[0].members: the type has no channel 2, 3.",
+        ),
+    ],
+)
+def test_a_mistake_in_what_may_be_added_is_named_in_whole_words(extra: str, message: str, tmp_path: Path) -> None:
+    _, problems = check(write(tmp_path, "force", GOOD + extra))
+    errors = [str(problem).partition(": ")[2] for problem in problems if problem.severity == "error"]
+    assert any(error.startswith(message) for error in errors), errors
+
+
+def test_what_is_doubtful_in_a_profile_is_a_warning(tmp_path: Path) -> None:
+    text = GOOD.replace('name = "force"\n', "") + "[channel.1.calibration]\nrequired = true\nmethod = 'polynomial'\n"
+    profile = load_profile(write(tmp_path, "force", text))
+    assert [warning.partition(": ")[2] for warning in profile.warnings] == [
+        "channel.1.calibration: the degree of the polynomial is left to the calibration file.",
+        "channel.1.name: the channel has no name; people will see its number only.",
+    ]
+    fixed = load_profile(write(tmp_path, "force2", text + "degree = 2\n"))
+    assert len(fixed.warnings) == 1
