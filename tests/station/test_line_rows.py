@@ -29,6 +29,9 @@ def test_a_job_stays_as_it_was_taken_but_for_its_state(station: Station) -> None
         ("open", False), ("closed", False), (None, False)
     ]  # fmt: skip
     line.set_job_state("job-1", "closed")
+    for state in ("open", "closed"):
+        line.set_job_state("job-1", state)
+        assert [row.state for row in line.jobs()] == ["closed", "open", state]
     line.put_end_seen("job-2")
     line.put_end_seen("job-2")
     line.put_end_seen("job-9")
