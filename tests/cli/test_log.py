@@ -16,7 +16,13 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
+from teds_provision.cli.rendering import local_time
+from teds_provision.station.station import Station
+from teds_provision.station.store.audit import AuditFilter
 from teds_provision.station.store.store import Store
+from teds_provision.trace import record as record_lines
+from teds_provision.trace.record import Record
+from tests.bench import PASSPHRASE
 from tests.terminal import on_terminal
 
 from .shell import call, clean_environment
@@ -216,3 +222,68 @@ def test_a_terminal_of_80_columns_cuts_nothing_off(home: Path) -> None:
     assert max(map(len, lines)) <= 80
     assert any(ONE in line and "whitelist" in line and "added" in line for line in lines)
     assert "assurance" in outcome.screen
+
+
+# -- whole outputs -----------------------------------------------------------------------------------------------------
+
+NODE = bytes(range(10))
+
+
+def test_the_lines_of_a_log_and_its_sum(home: Path) -> None:
+    with Station.open(home, ask=lambda prompt, confirm: PASSPHRASE) as station:
+        first = station.audit_log.newest()[0]
+        station.audit("verify", NODE, "authentic", digest="ab" * 32, count=3, nothing=None, name="left hand")
+        station.audit("agree", NODE, "refused: other key")
+        station.audit("verify", None, "done")
+        entries = list(station.audit_log.chosen(AuditFilter(), first))
+    outcome = call(home, "log", "--last", "3")
+    heads = [f"{entry.seq:>5}  {local_time(entry.at)}  {entry.who}  " for entry in entries]
+    assert outcome.out.splitlines() == [
+        f"{heads[0]}verify     {NODE.hex()}  authentic  count 3, digest {'ab' * 8}, name left hand",
+        f"{heads[1]}agree      {NODE.hex()}  refused: other key",
+        f"{heads[2]}verify     -                     done",
+    ]
+    count, head = entries[-1].seq, entries[-1].hash
+    assert outcome.err == f"{count} entries, chain intact from entry {first + 1} on, head {head[:16]}.\n"
+    failed = call(home, "log", NODE.hex(), "--failed")
+    assert len(failed.out.splitlines()) == 1
+    assert failed.err.splitlines()[0] == "1 entry, 1 failed: 1 agree"
+    none = call(home, "log", "--act", "nothing")
+    assert (none.out, none.err.splitlines()[0]) == ("", "0 entries, 0 failed.")
+    found = json.loads(call(home, "--json", "log", "--last", "3").out)
+    assert found.pop("entries")[0] == {
+        "seq": first + 1, "at": entries[0].at, "who": entries[0].who, "actor": entries[0].actor, "act": "verify",
+        "uuid": NODE.hex(), "outcome": "authentic",
+        "detail": {"digest": "ab" * 32, "count": 3, "nothing": None, "name": "left hand"}, "hash": entries[0].hash,
+    }  # fmt: skip
+    assert found == {
+        "intact": True, "checked": {"after": first, "to": count}, "count": count, "head": head, "first_bad": None,
+        "why": "", "totals": {"entries": 3, "failed": 1, "acts": {"verify": 2, "agree": 1}},
+    }  # fmt: skip
+    both = call(home, "log", "--today", "--since", "2h")
+    assert (both.code, "--today and --since cannot be combined." in both.err) == (2, True)
+
+
+def test_a_trace_is_shown_line_by_line(home: Path, tmp_path: Path) -> None:
+    path = tmp_path / "t.trace"
+    records = [
+        Record(1.5, "out", "can", "frame", bytes(8), "f1 to 21: x", identifier=0x18DA21F1),
+        Record(2.0, "in", "nfc", "message", b"\1" * 30, "List", opened=b"\2" * 25, sealed=True, uuid=NODE.hex()),
+        Record(3.0, "in", "ble", "frame", b"\3" * 24),
+        Record(4.0, "out", "nfc", "message", b"\4", "Sealed, not opened", sealed=True),
+    ]
+    path.write_bytes(record_lines.head() + b"".join(map(record_lines.line, records)))
+    times = [datetime.fromtimestamp(record.time).astimezone().strftime("%H:%M:%S") for record in records]
+    shown = call(home, "trace", "show", path).out.splitlines()
+    assert shown == [
+        f"{times[0]}.500 can  >   f1 to 21: x  18da21f1 {'00' * 8}",
+        f"{times[1]}.000 nfc  < List  sealed  {'02' * 24}…",
+        f"{times[2]}.000 ble  <     {'03' * 24}",
+        f"{times[3]}.000 nfc  > Sealed, not opened  sealed  04",
+    ]
+    whole = call(home, "trace", "show", path, "--messages", "--whole").out.splitlines()
+    assert whole == [f"{times[1]}.000 nfc  < List  sealed  {'02' * 25}", shown[3]]
+    frames = json.loads(call(home, "--json", "trace", "show", path, "--messages").out)["frames"]
+    assert frames == [records[1].as_json(), records[3].as_json()]
+    path.write_bytes(record_lines.head())
+    assert call(home, "trace", "show", path).out == "The trace is empty.\n"

@@ -217,6 +217,47 @@ def test_a_line_that_is_none_changes_nothing_and_is_counted(line: bytes) -> None
     assert source.at(1, 1.0) == Reading(value=2.0)
 
 
+def test_of_lines_that_are_none_the_first_and_each_thousandth_is_reported() -> None:
+    messages: list[str] = []
+    source, _ = lines(messages)
+    for _ in range(2000):
+        assert source.feed_line(b"[]") == "it is not a JSON object"
+    assert [message.split("(")[1] for message in messages] == [
+        "1 so far): it is not a JSON object.",
+        "1000 so far): it is not a JSON object.",
+        "2000 so far): it is not a JSON object.",
+    ]
+    assert source.dropped == 2000
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (b"{", "it is not JSON"),
+        (b"5", "it is not a JSON object"),
+        (b'{"t": 1, "value": []}', '"value" is not an object of channel names and numbers'),
+        (b'{"t": 1, "raw": 5}', '"raw" is not an object of channel names and numbers'),
+        (b'{"t": 1, "value": {"angel": 1}}', "the node has no sensor named 'angel'"),
+        (b'{"t": 1, "raw": {"angle": true}}', "the value of 'angle' is no number"),
+        (b'{"t": 1, "value": {"angle": "1"}}', "the value of 'angle' is no number"),
+        (b'{"value": {"angle": 1}}', '"t" is not a number of seconds of 0 or more'),
+        (b'{"t": -0.1}', '"t" is not a number of seconds of 0 or more'),
+        (b'{"t": true}', '"t" is not a number of seconds of 0 or more'),
+        (b'{"t": 2.9}', '"t" went back from 3.0 to 2.9'),
+    ],
+)
+def test_why_a_line_is_skipped(line: bytes, why: str) -> None:
+    source, clock = lines([])
+    assert source.feed_line(b'{"t": 3, "value": {"angle": 1}, "raw": {"force": 7}}') == ""
+    assert source.latest == {1: Reading(value=1.0), 2: Reading(raw=7.0)}
+    assert source.feed_line(line) == why
+    assert (source.at(1, 0.0), clock.steps) == (Reading(value=1.0), [3.0])
+    assert source.feed_line(b'{"t": 3, "value": {"angle": null}}') == "", "two lines may be of one instant"
+    assert (source.at(1, 0.0), source.at(2, 0.0)) == (None, Reading(raw=7.0))
+    source.end()
+    assert (source.at(2, 0.0), clock.own) == (None, False)
+
+
 def test_a_number_beyond_every_quantity_is_none() -> None:
     source, clock = lines([])
     for member in ("value", "raw"):
