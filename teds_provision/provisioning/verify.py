@@ -395,7 +395,8 @@ def require_authentic(verified: Verification) -> None:
         )
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[SESSION].why)
-    reason = next((failed[name] for name in FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
+    in_order = list(reversed(failed.values()))
+    reason = next((check for check in in_order if check.name in FRESHNESS), in_order[0])
     raise BadDatasheetError(f"The datasheet is {verified.verdict}: {reason.why or reason.name}.")
 
 

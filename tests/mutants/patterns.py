@@ -1268,8 +1268,8 @@ PATTERNS = (
     ),
     Pattern(
         "a name in a sheet is no formula",
-        "to_csv",
-        "name[:1] in ('=', '+', '-', '@')",
+        "_as_text",
+        "text[:1] in ('=', '+', '-', '@')",
         "False",
         "tests/plant/test_yield_table.py",
     ),

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotWhitelistedError, PolicyError
+from teds_provision.errors import (
+    BadDatasheetError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    PolicyError,
+    TedsProvisionError,
+    UnprovenError,
+)
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.datasheet import sign_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
@@ -17,12 +25,19 @@ from teds_provision.provisioning.build import build
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.sign import SignOrder, known_node_keys, sign, sign_image
 from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify import FreshnessFloor, freshness_floor_of, verify_image
+from teds_provision.provisioning.verify import (
+    FreshnessFloor,
+    freshness_floor_of,
+    possession_check,
+    require_authentic,
+    session_check,
+    verify_image,
+)
 from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.provisioning.write import write
-from teds_provision.shapes.verdict import Verification
+from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import TrustRecord
+from teds_provision.station.store.records import RevocationRecord, TrustRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
@@ -296,3 +311,196 @@ def test_a_meta_teds_names_its_node_in_whichever_place_the_field_is(fields: byte
     meta = frame(b"\x03\x04\x00\x01\x01\x01" + fields)
     assert datasheet.meta_names(meta, b"u" * 10) is holds
     assert not datasheet.meta_names(meta[:-1] + bytes([meta[-1] ^ 1]), b"u" * 10), "the checksum is wrong"
+
+
+# -- in whole words ----------------------------------------------------------------------------------------------------
+
+
+def words(station: Station, image: Image, floor: FreshnessFloor | None = None) -> dict[str, tuple[str, str]]:
+    """Return result and reason of each check, in their order; the keys' digits by their owners."""
+    shown = {
+        fingerprint(station.point)[:16]: "STATION",
+        fingerprint(station.ca)[:16]: "CA",
+        fingerprint(security.decode(station_image_key(image)).node_key)[:16]: "NODE",
+    }
+    found = {}
+    for check in verify_image(station, image, floor=floor):
+        why = check.why
+        for digits, owner in shown.items():
+            why = why.replace(digits, owner)
+        found[check.name] = (check.result, why)
+    return found
+
+
+def station_image_key(image: Image) -> bytes:
+    return image.blocks[SECURITY]
+
+
+GOOD = {
+    "form": ("passed", "4 TEDS"),
+    "canonical form": ("passed", ""),
+    "algorithms": ("passed", "ECDSA P-256, SHA-256, AES-128"),
+    "node key": ("passed", "NODE, pinned"),
+    "key epoch": ("skipped", "a file does not show the node's current state"),
+    "sequence": ("skipped", "a file does not show the node's current state"),
+    "not revoked": ("passed", ""),
+    "signed": ("passed", ""),
+    "signing station": ("passed", "STATION"),
+    "station certificate": ("passed", "CA CA"),
+    "signature": ("passed", ""),
+    "signed TEDS": ("passed", "3 digests"),
+    "every TEDS is signed": ("passed", ""),
+    "UUID": ("passed", ""),
+}
+
+
+def test_every_check_of_a_good_image_in_its_order(station: Station, image: Image, board: Board) -> None:
+    small = {block: octets for block, octets in image.blocks.items() if block[0] == 0}
+    assert len(small) == 3, "Meta-TEDS, name and Security TEDS"
+    checks = words(station, image)
+    expected = GOOD | {
+        "form": ("passed", f"{len(image.blocks)} TEDS"),
+        "signed TEDS": ("passed", f"{len(image.blocks) - 1} digests"),
+    }
+    assert checks == expected
+    assert list(checks) == list(expected)
+    now = FreshnessFloor(board.tim.identity(), 1, 1)
+    assert words(station, image, now) == expected | {"key epoch": ("passed", "1"), "sequence": ("passed", "1")}
+    station.pins.remove(image.uuid)
+    assert words(station, image)["node key"] == ("passed", "NODE, not pinned here")
+
+
+@pytest.mark.parametrize(
+    ("floor", "name", "why"),
+    [
+        (FreshnessFloor(None, 2, 1), "sequence", "sequence 1 is older than the 2 that this station saw on the node"),
+        (FreshnessFloor(None, 1, 2), "key epoch", "signed for epoch 1, older than the 2 that this station saw"),
+    ],
+)
+def test_what_is_older_than_what_was_seen_says_so(
+    station: Station, image: Image, floor: FreshnessFloor, name: str, why: str
+) -> None:
+    assert words(station, image, floor)[name] == ("failed", why)
+    assert [check for check, (result, _) in words(station, image, floor).items() if result == "failed"] == [name]
+
+
+def test_what_is_older_than_the_nodes_own_values_says_so_first(station: Station, image: Image, board: Board) -> None:
+    """Which of two such faults the error named was another from run to run."""
+    newer = replace(board.tim.identity(), sequence=2, epoch=0)
+    checks = words(station, image, FreshnessFloor(newer, 9, 9))
+    assert checks["sequence"] == ("failed", "sequence 1 is older than the node's own 2: an old datasheet was restored")
+    assert checks["key epoch"] == ("failed", "signed for epoch 1, but the node is at 0")
+    with pytest.raises(
+        BadDatasheetError, match=r"^The datasheet is not authentic: signed for epoch 1, but the node is at 0\.$"
+    ):
+        require_authentic(Verification(image.uuid, tuple(verify_image(station, image, floor=FreshnessFloor(newer)))))
+
+
+def failures(station: Station, image: Image) -> dict[str, str]:
+    return {check.name: check.why for check in verify_image(station, image) if check.result == "failed"}
+
+
+def test_what_is_wrong_with_an_image_in_whole_words(station: Station, image: Image, board: Board) -> None:
+    shown = security.decode(image.blocks[SECURITY])
+    name = image.blocks[0, 12]
+    initial = Image(board.uuid, {SECURITY: replace(shown, signature=None).encode()})
+    assert failures(station, Image(board.uuid, {})) == {"signed": "the image has no Security TEDS"}
+    foreign = image.with_block(SECURITY, frame(security.TEDSID_TUPLE + b"\x01\x01\x04"))
+    assert failures(station, foreign) == {
+        "canonical form": "the Security TEDS does not follow this profile: shown, never trusted"
+    }
+    ours = image.with_block(SECURITY, frame(security.TEDSID_TUPLE + bytes([105, 1, 1])))
+    assert failures(station, ours) == {"canonical form": "The Security TEDS lacks field 1."}
+    assert initial.security is not None
+    broken = name[:-1] + bytes([name[-1] ^ 1])
+    assert failures(station, image.with_block((0, 12), broken)) == {
+        "form": "length, checksum or class is wrong: TEDS 12 of channel 0",
+        "signed TEDS": "TEDS 12 of channel 0 is missing or changed",
+    }
+    without = Image(
+        board.uuid, {place: octets for place, octets in image.blocks.items() if place not in ((0, 1), (0, 12))}
+    )
+    assert failures(station, without) == {
+        "signed TEDS": "TEDS 1 of channel 0 is missing or changed, TEDS 12 of channel 0 is missing or changed"
+    }
+    more = (
+        image.with_block((2, 12), name)
+        .with_block((1, 12), name)
+        .with_block((1, 7), frame(bytes.fromhex("030400070101")))
+    )
+    assert failures(station, more)["every TEDS is signed"].endswith("TEDS 12 of channel 2 is unsigned")
+    assert failures(station, more)["every TEDS is signed"].startswith("TEDS 7 of channel 1 is unsigned, ")
+    other = Image(bytes(9) + b"\1", image.blocks)
+    assert failures(station, other) == {
+        "node key": "field 102 does not sign this key for this UUID",
+        "signature": "field 100 does not verify: the datasheet was changed or belongs to another node",
+        "UUID": "the Meta-TEDS names another",
+    }
+    weak = replace(shown, values={**shown.values, 2: 0, 4: 0}).encode()
+    assert (
+        failures(station, image.with_block(SECURITY, weak))["algorithms"] == "weak or unknown algorithm in field 2, 4"
+    )
+    station.policy.deny(RevocationRecord(board.uuid, None, "stolen", "{}"))
+    assert failures(station, image) == {"not revoked": "revoked: stolen"}
+
+
+def test_a_station_that_is_trusted_by_itself_needs_no_ca(station: Station, image: Image, tmp_path: Path) -> None:
+    other = make_station(tmp_path / "other")
+    digits = fingerprint(station.point)[:16]
+    assert failures(other, image) == {
+        "signing station": f"station {digits} is neither trusted here nor certified by a trusted CA",
+        "station certificate": "field 104 matches no trusted CA",
+    }
+    other.policy.trust(TrustRecord("bench", "station", station.point, fingerprint(station.point)))
+    checks = {check.name: check for check in verify_image(other, image)}
+    assert checks["signing station"] == Check("signing station", "passed", digits)
+    assert checks["station certificate"] == Check(
+        "station certificate", "skipped", "the station itself is trusted; its CA is not known here"
+    )
+
+
+def test_which_failure_of_a_datasheet_its_error_names() -> None:
+    def raised(*checks: Check) -> tuple[type[Exception], str]:
+        with pytest.raises(TedsProvisionError) as refused:
+            require_authentic(Verification(bytes(10), checks))
+        return type(refused.value), refused.value.message
+
+    good = Check("signature", "passed", "")
+    require_authentic(Verification(bytes(10), (good, Check("session", "passed", ""))))
+    assert raised(Check("form", "failed", "first"), Check("UUID", "failed", "second")) == (
+        BadDatasheetError,
+        "The datasheet is not authentic: first.",
+    )
+    assert raised(Check("form", "failed", "first"), Check("sequence", "failed", "old")) == (
+        BadDatasheetError,
+        "The datasheet is not authentic: old.",
+    )
+    assert raised(Check("form", "failed", "")) == (BadDatasheetError, "The datasheet is not authentic: form.")
+    assert raised(good, Check("session", "failed", "it is mute")) == (
+        UnprovenError,
+        f"Nothing could be proven about node {'00' * 10}: it is mute.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("opened", "why", "result", "text"),
+    [
+        ("opened", "no", "passed", "opened"),
+        ("", "no", "failed", "no"),
+        ("", "", "skipped", "this station holds no key of this node"),
+    ],
+)
+def test_what_a_session_proves(opened: str, why: str, result: str, text: str) -> None:
+    assert session_check(opened, why) == Check("session", result, text)  # type: ignore[arg-type]
+
+
+def test_a_challenge_is_a_check_and_a_lost_link_is_none() -> None:
+    def fail(error: TedsProvisionError) -> None:
+        raise error
+
+    assert possession_check(lambda: None) == Check("possession", "passed", "the node signed a fresh challenge")
+    assert possession_check(lambda: fail(NotAuthenticError("It cannot."))) == Check(
+        "possession", "failed", "It cannot."
+    )
+    with pytest.raises(NodeSilentError):
+        possession_check(lambda: fail(NodeSilentError("gone")))

@@ -37,6 +37,7 @@ def pairs(text: str) -> list[tuple[float, ...]]:
     [
         "1,2\n3,4.5\n",
         "1;2\n3;4,5\n",
+        "1;2,0\n3;4,5\n",
         "1\t2\n3\t4,5\n",
         "1 2\n3   4.5\n",
         "1, 2\n\n ,;\n3, 4.5,,\n",
@@ -76,6 +77,7 @@ def test_a_table_keeps_the_line_of_each_row_its_unit_and_its_metadata() -> None:
         ),
         ("ch,raw\n1,2\n", "c.csv:1: the header names 1 columns besides the channel; raw value and value are two."),
         ("raw,value\n1,2,3\n", "c.csv:2: 3 columns where 2 are expected."),
+        ("raw,value,ch\n1,2\n", "c.csv:2: 2 columns where 3 are expected."),
         ("raw,value,#\n1,2,3,4\n", "c.csv:2: 4 columns where 3 are expected."),
         ("raw,value\n1\n", "c.csv:2: 1 columns where 2 are expected."),
         ("raw,value\n1,2.x\n", 'c.csv:2: value: "2.x" is not a number.'),
@@ -344,3 +346,20 @@ def test_points_are_fitted_as_they_are_without_a_type() -> None:
     assert (whole.method, whole.inputs[0].degree, whole.unit.text) == ("polynomial", 2, "1")
     with pytest.raises(BadDataError, match="these are segments with coefficients; there are no points to fit"):
         fit_points("from,to,offset,c0\n0,1,0,5\n", "c.csv")
+
+
+def test_two_points_make_a_line_and_more_a_table_and_the_unit_of_a_line_goes_before_the_headers() -> None:
+    assert fit_points("0,0\n1,1\n", "c.csv")[1].method == "linear"
+    assert fit_points("0,0\n1,1\n2,2\n", "c.csv")[1].method == "table"
+    assert fit_points("# unit: mrad\nraw,value [degree]\n0,0\n1,1\n", "c.csv")[1].unit.text == "mrad"
+
+
+@pytest.mark.parametrize(
+    ("stated", "uncertainty"), [("", 0.675), ("# uncertainty: 0.1\n", 0.675), ("# uncertainty: 3\n", 3.0)]
+)
+def test_the_uncertainty_is_the_stated_one_or_the_largest_residual_if_that_is_greater(
+    stated: str, uncertainty: float
+) -> None:
+    text = f"# method: linear\n{stated}0,0\n1,1.75\n2,1.25\n3,3\n"
+    found = fit_points(text, "c.csv")[1]
+    assert found.uncertainty == pytest.approx(uncertainty)
