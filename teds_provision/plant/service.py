@@ -62,6 +62,8 @@ class PlantWatch:
         self._threads: list[threading.Thread] = []
         self._transport: Transport | None = None
         self._listener: Registry | None = None
+        self._place: str | None = None
+        """Where the transport leads, as the store has it; `registry connect` may name another place at any time."""
         self._told = ("", "")
         self._look_again = 0.0
 
@@ -224,6 +226,7 @@ class PlantWatch:
         """Run one sync; True if another command of this home runs one."""
         station = self._station
         try:
+            self._follow(self._named_place())
             if self._transport is None:
                 self._transport = plant.connecting.open_transport(station)
             if self._transport is None:
@@ -245,6 +248,20 @@ class PlantWatch:
         else:
             self._after(done.pushed + done.fetched + done.parcels_in + done.parcels_out + len(done.rosters))
         return False
+
+    def _named_place(self) -> str | None:
+        record = self._station.plant.joined
+        return record.url if record is not None else None
+
+    def _follow(self, place: str | None) -> None:
+        """Let go of the connections to another place than this."""
+        if place == self._place:
+            return
+        if self._transport is not None:
+            self._transport.close()
+        self._transport, self._place, self._look_again = None, place, 0.0
+        if self._listener is not None:
+            self._listener.interrupt()
 
     def _after(self, moved: int) -> None:
         record, roster = self._station.plant.joined, self._station.plant.roster
@@ -280,14 +297,17 @@ class PlantWatch:
         """Start a sync when the registry notifies of a change."""
         while not self._stop.is_set():
             try:
-                if self._listener is None:
-                    self._listener = plant.connecting.listener(self._station)
-                    if self._listener is None:
-                        return
+                place = self._named_place()
+                if self._listener is not None:
+                    self._listener.close()
+                self._listener = plant.connecting.listener(self._station)
+                if self._listener is None:  # a folder, which may become a database
+                    self._stop.wait(EVERY)
+                    continue
                 self._listener.listen()
                 self._wake.set()  # finds what was pushed before
                 swept = 0.0
-                while not self._stop.is_set():
+                while not self._stop.is_set() and self._named_place() == place:
                     if time.monotonic() - swept >= EVERY:  # also detects a lost connection
                         self._listener.sweep()
                         swept = time.monotonic()

@@ -16,13 +16,14 @@ from teds_provision.ncap.web.metrics import text
 from teds_provision.plant import connecting, membership, service
 from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.plant.schema import member_sql
+from teds_provision.plant.schema import member_sql, registry_sql
 from teds_provision.plant.service import EVERY, PlantWatch
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.station.station import Station
 from tests.pace import until
 from tests.plant.handing import board_of
+from tests.plant.postgres import Database
 from tests.plant.stations import Plant
 from tests.plant.test_synced_by_database import Office
 
@@ -85,6 +86,37 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
                       "budget": {"used": 0}, "clients": 0}, [watch])  # fmt: skip
         assert "teds_registry_alarms 0\n" in lines
         assert "teds_registry_age_seconds " in lines
+    finally:
+        watch.stop()
+
+
+def test_the_service_follows_the_registry_to_another_database(
+    office: Office, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It went on with the old one, and said "synced", until it was started anew; nothing of the new one arrived."""
+    monkeypatch.setattr(service, "EVERY", 0.5)
+    north, south = by_url(office, office.north), by_url(office, office.plant.stations[1])
+    first = office.database
+    board_of(north, os.urandom(10))
+    synced(north)
+    watch, published, _ = watching(south)
+    watch.start()
+    try:
+        until(lambda: any(entry["state"] == "synced" for entry in published), published)
+        office.database = Database(cluster, f"{first.name}_new", first.registry)
+        cluster.psql(f"create database {office.database.name}")
+        office.database.sql(registry_sql(first.registry))
+        for station in (north, south):
+            asked = open_request(membership.request(station))
+            office.database.sql(member_sql(asked.fingerprint, asked.login))
+            with station.transaction():
+                station.plant.join(first.registry, office.database.url)
+        for _ in range(2):  # by a sync of its own, then by the notification of the new database
+            board = board_of(north, os.urandom(10))
+            synced(north)
+            until(lambda uuid=board.uuid: uuid in south.plant.claims.of_nodes([uuid]), published)
+        assert south.plant.alarms.all() == north.plant.alarms.all() == []
+        assert first.sql("select max(n) from registry.page") == [["1"]]
     finally:
         watch.stop()
 

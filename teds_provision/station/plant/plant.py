@@ -164,14 +164,19 @@ class Plant:
             self._store.execute("DELETE FROM meta WHERE name IN ('plant-returned', 'plant-seen-heads', 'plant-acts')")
 
     def join(self, registry: str, url: str | None) -> None:
-        """Take part in a registry (the vault opens); all that is kept of another one is forgotten."""
+        """Take part in a registry (the vault opens); all that is kept of another one is forgotten.
+
+        Another place for the same one has acknowledged nothing yet: that pages are not there is no sign of a rollback.
+        """
         mac = self._row_macs.note("plant", registry)
         before = self.record()
         if before is not None and before.registry != registry:
             self.forget()
             before = None
         record = before or PlantRecord(registry)
-        self.put_record(replace(record, left=None, url=url or record.url, mac=mac))
+        moved = url is not None and record.url is not None and url != record.url
+        acknowledged = 0 if moved else record.acknowledged
+        self.put_record(replace(record, left=None, url=url or record.url, acknowledged=acknowledged, mac=mac))
         if before is None:
             self.put_folded_acts(event.FORMS)
 
