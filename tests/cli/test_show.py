@@ -530,3 +530,67 @@ def test_what_show_cannot_mean(show, words, why):
 def test_a_plot_is_of_one_file(show, name_file, tmp_path):
     code, _, err = show(name_file, name_file, "--plot", tmp_path / "p.svg")
     assert (code, "--plot works with one file." in err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("file", "lines"),
+    [
+        (
+            "m07_read_teds_reply.hex",
+            [
+                "Reply to Read TEDS segment · reply, 2007 edition",
+                "offset  argument  value                                                          meaning",
+                "3       offset    0",
+                "7       octets    000000190304000c0101040100050c626f696c65722d696e… (29 octets)",
+                "note  octet 3, reply-guessed: A reply does not say what it answers; it is read as what its form fits.",
+                "",
+                "TEDS at octet 7:",
+                "XdcrName (12) · 2007 edition · 29 octets · clean",
+                "offset  type  field   value         meaning",
+                "     4     3  TEDSID  00 0c 01 01",
+                "    10     4  Format  0             user defined",
+                "    13     5  TCName  boiler-inlet",
+            ],
+        ),
+        ("m07_fail_reply.hex", ["Failure · reply, 2007 edition · failed"]),
+        (
+            "m24_sample_cmd.hex",
+            [
+                "transducer access: Synchronous read of sample, one channel of one TIM, command · network-service, "
+                "2024 edition · channel 1",
+                "offset  argument       value                             meaning",
+                "5       app            00303900303900303907e80549365990",
+                "21      ncap           00303900303900303907e80549382e50",
+                "37      tim            86258a0b72f612d68707e8054911dcf0",
+                "53      channel        1",
+                "55      sampling_mode  3",
+                "56      timeout        5.0 s",
+            ],
+        ),
+    ],
+)
+def test_a_message_as_a_table(show, file, lines):
+    code, out, _ = show(VECTORS / file)
+    assert (code, lines_of(out)) == (0, lines)
+
+
+def test_a_message_as_json(show_json):
+    _, found = show_json(VECTORS / "m24_sample_cmd.hex")
+    assert found["message"] == {
+        "kind": "network-service",
+        "name": "Synchronous read of sample, one channel of one TIM, command",
+        "group": found["message"]["group"], "group_name": "transducer access",
+        "function": found["message"]["function"], "channel": 1, "ok": None, "school": found["message"]["school"],
+    }  # fmt: skip
+    assert found["fields"][-1] == {"name": "timeout", "type": "duration", "value": 5.0, "offset": 56}
+    assert (found["verdict"], found["access_code"], found["findings"]) == ("message", None, [])
+    assert "inside" not in found
+    _, reply = show_json(VECTORS / "m07_read_teds_reply.hex")
+    assert [inside["name"] for inside in reply["inside"]] == ["XdcrName"]
+    assert reply["findings"][0]["code"] == "reply-guessed"
+
+
+def test_a_field_in_a_field_is_indented(show, image):
+    out = lines_of(show(image)[1])
+    at = next(at for at, line in enumerate(out) if line.split()[2:3] == ["Sample"])
+    assert out[at + 1].index("DatModel") == out[at].index("Sample") + 2
