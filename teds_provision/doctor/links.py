@@ -177,9 +177,8 @@ def nfc(system: System) -> Iterator[Finding]:
     try:
         tag = any(reader.sense() is not None for _ in range(_SENSES))
     except nfc_tag.ReaderLostError as error:
-        yield Finding(
-            "nfc", "failed", f"{reader.name} opened but failed immediately: {error}.", "Unplug it, plug it in."
-        )
+        why = f"{reader.name} opened but failed immediately: {error.message}"
+        yield Finding("nfc", "failed", why, "Unplug it, plug it in.")
         return
     finally:
         reader.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import platform
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -142,11 +143,13 @@ def _drift(system: System) -> float | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the leading numbers of a version: enough to compare releases."""
+    """Return the leading numbers of a version: enough to compare releases (1.2.3rc4 counts as 1.2.3)."""
     numbers = []
     for part in version.split("."):
-        digits = "".join(character for character in part if character.isdigit())
-        if not part[:1].isdigit():
+        digits = re.match(r"[0-9]*", part)
+        if digits is None or not digits[0]:
             break
-        numbers.append(int(digits))
+        numbers.append(int(digits[0]))
+        if digits[0] != part:
+            break
     return tuple(numbers)

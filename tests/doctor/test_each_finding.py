@@ -1,0 +1,403 @@
+"""The doctor's findings about readers, buses, Bluetooth and the machine, word for word, each fault made here."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.doctor import links, machine
+from teds_provision.doctor.checks import Finding, System, exit_code, intact
+from teds_provision.errors import NoReaderError
+from teds_provision.links.nfc import pcsc_readers
+
+from .test_doctor import plug_in
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> System:
+    (tmp_path / "system").mkdir()
+    return System(tmp_path / "home", workspace=tmp_path, root=tmp_path / "system", environment={})
+
+
+def one(found: Iterator[Finding]) -> Finding:
+    (finding,) = found
+    return finding
+
+
+# -- readers -----------------------------------------------------------------------------------------------------------
+
+
+def usb(system: System, *, driver: str | None = None) -> Finding:
+    vendor, product = next(iter(links.READERS))
+    plug_in(system, vendor, product, driver=driver)
+    first, *_ = links.readers(system)
+    return first
+
+
+@pytest.mark.parametrize(("nfc", "result"), [(None, "warning"), ("udp:localhost:5", "warning"), ("usb", "failed")])
+def test_a_reader_in_use_is_a_failure_only_if_it_was_asked_for(system: System, nfc: str | None, result: str) -> None:
+    asked = replace(system, nfc=nfc)
+    found = usb(asked, driver="pn533_usb")
+    vendor, product = next(iter(links.READERS))
+    what = links.READERS[vendor, product]
+    assert found == Finding(
+        f"reader usb:{vendor:04x}:{product:04x}",
+        result,  # type: ignore[arg-type]
+        f"{what} is in use by the kernel driver pn533_usb.",
+        "sudo modprobe -r pn533_usb; echo blacklist pn533_usb | sudo tee /etc/modprobe.d/nfc-blacklist.conf",
+    )
+
+
+def test_a_reader_that_another_program_has_and_one_that_is_being_unplugged(system: System) -> None:
+    vendor, product = next(iter(links.READERS))
+    what, name = links.READERS[vendor, product], f"reader usb:{vendor:04x}:{product:04x}"
+    assert usb(system, driver="usbfs") == Finding(
+        name, "warning", f"{what} is in use by another program.",
+        "Stop it; for pcscd: sudo systemctl stop pcscd.socket pcscd",
+    )  # fmt: skip
+    (system.at("/sys/bus/usb/devices") / "1-2" / "devnum").unlink()
+    assert next(links.readers(system)) == Finding(
+        name, "warning", f"{what} is being plugged in or removed.", "Run doctor again."
+    )
+
+
+def test_a_reader_that_may_not_be_opened_gets_its_rule(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, how: how != os.R_OK | os.W_OK)
+    vendor, product = next(iter(links.READERS))
+    found = usb(replace(system, nfc="usb:x"))
+    assert found.result == "failed"
+    assert found.why == (
+        f"You do not have permission to open {links.READERS[vendor, product]} at /dev/bus/usb/001/005 (mode 0666)."
+    ) or found.why.endswith(f"at {links._shown(system, system.at('/dev/bus/usb/001/005'))}.")
+    assert found.fix == (
+        f'echo \'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}", '
+        'TAG+="uaccess", GROUP="plugdev", MODE="0660"\' | sudo tee /etc/udev/rules.d/70-nfc.rules, '
+        "then plug the reader in again"
+    )
+
+
+def test_the_mode_of_a_device_is_shown_if_it_is_there(system: System) -> None:
+    node = system.at("/dev/x")
+    node.parent.mkdir(parents=True)
+    assert links._shown(system, node) == "/dev/x"
+    node.touch()
+    node.chmod(0o640)
+    assert links._shown(system, node) == "/dev/x (mode 0640)"
+
+
+@pytest.mark.parametrize(
+    ("asked", "names", "result", "why", "fix"),
+    [
+        (None, ["ACS"], "ok", "Readers: --nfc 'pcsc:ACS'.", ""),
+        ("pcsc", ["A", "B"], "ok", "Readers: --nfc 'pcsc:A', --nfc 'pcsc:B'.", ""),
+        (None, [], "skipped", "pcscd has no reader.", ""),
+        ("usb", [], "skipped", "pcscd has no reader.", ""),
+        ("pcsc:ACS", [], "failed", "pcscd has no reader.",
+         "Plug it in; pcsc_scan (package pcsc-tools) lists the readers of pcscd"),
+        (None, None, "skipped", "No pcscd.", ""),
+        ("pcsc", None, "failed", "No pcscd.", "Start it."),
+    ],
+)  # fmt: skip
+def test_readers_of_pcscd(
+    system: System, monkeypatch: pytest.MonkeyPatch, asked: str | None, names: Any, result: Any, why: str, fix: str
+) -> None:
+    def found() -> list[str]:
+        if names is None:
+            raise NoReaderError("No pcscd.", hint="Start it.")
+        return list(names)
+
+    monkeypatch.setattr(pcsc_readers, "names", found)
+    monkeypatch.setattr(pcsc_readers, "contactless", lambda found: found)
+    here = replace(system, nfc=asked, root=Path("/"))
+    assert one(links.pcsc(here)) == Finding("pc/sc", result, why, fix)
+    assert one(links.pcsc(system)).why == "These checks are running on another machine's files."
+
+
+class Reader:
+    """A reader with a tag at the sense of this number; 0: none."""
+
+    name = "simulated"
+
+    def __init__(self, tag_at: int, *, lost: bool = False) -> None:
+        self.tag_at, self.lost, self.senses, self.closed = tag_at, lost, 0, False
+
+    def sense(self) -> object:
+        self.senses += 1
+        if self.lost:
+            raise links.nfc_tag.ReaderLostError("unplugged")
+        return object() if self.senses == self.tag_at else None
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize(
+    ("path", "tag_at", "result", "why", "fix"),
+    [
+        ("usb", 8, "ok", "simulated on usb opens; there is a tag on it.", ""),
+        ("usb", 9, "ok", "simulated on usb opens; there is nothing on it.", ""),
+        ("udp:localhost:7", 1, "ok", "simulated on udp:localhost:7 opens; there is a tag on it.", ""),
+        ("udp:localhost:7", 0, "warning", "simulated on udp:localhost:7 opens; there is nothing on it.",
+         "teds-provision node run DIR --nfc udp:localhost:7"),
+    ],
+)  # fmt: skip
+def test_the_reader_that_was_asked_for(
+    system: System, monkeypatch: pytest.MonkeyPatch, path: str, tag_at: int, result: Any, why: str, fix: str
+) -> None:
+    reader = Reader(tag_at)
+    monkeypatch.setattr(links.nfc_reader, "open_reader", lambda _: reader)
+    assert one(links.nfc(replace(system, nfc=path))) == Finding("nfc", result, why, fix)
+    assert reader.closed
+
+
+def test_a_reader_that_is_lost_at_once_is_closed(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = Reader(0, lost=True)
+    monkeypatch.setattr(links.nfc_reader, "open_reader", lambda _: reader)
+    found = one(links.nfc(replace(system, nfc="usb")))
+    assert (found.result, found.fix) == ("failed", "Unplug it, plug it in.")
+    assert found.why == "simulated opened but failed immediately: The reader no longer answers (unplugged)."
+    assert reader.closed
+    assert one(links.nfc(system)).result == "skipped"
+
+
+def test_serial_ports_that_may_not_be_opened_are_named(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = [system.at(f"/dev/tty{name}") for name in ("USB1", "ACM0", "AMA3", "S0")]
+    for port in ports:
+        port.parent.mkdir(parents=True, exist_ok=True)
+        port.touch()
+    assert one(links.serial_ports(system)) == Finding("serial ports", "ok", "ttyACM0, ttyAMA3, ttyUSB1 can be opened.")
+    monkeypatch.setattr(os, "access", lambda path, how: "USB" not in str(path))
+    assert one(links.serial_ports(system)) == Finding(
+        "serial ports", "warning", "You do not have permission to open ttyUSB1.",
+        "sudo adduser $USER dialout, then log in again",
+    )  # fmt: skip
+
+
+def test_a_loopback_that_is_closed_stops_simulated_readers_alone(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert one(links.nfc_loopback(system)) == Finding("nfc loopback", "ok", "Simulated readers (udp:) work.")
+
+    class Closed(socket.socket):
+        def sendto(self, *_: Any) -> int:
+            raise OSError(101, "Network is unreachable")
+
+    monkeypatch.setattr(socket, "socket", Closed)
+    found = one(links.nfc_loopback(system))
+    assert (found.result, found.fix) == ("warning", "sudo ip link set lo up; allow loopback in the firewall")
+    assert "Network is unreachable" in found.why
+
+
+# -- CAN ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "rate", "state", "finding"),
+    [
+        ("0x40081", 250000, "ERROR-ACTIVE",
+         Finding("can can0", "ok", "can0 is up, 250000 bit/s: --can socketcan:can0.")),
+        ("0x40081", 0, "", Finding("can can0", "ok", "can0 is up: --can socketcan:can0.")),
+        ("0x40080", 250000, "", Finding("can can0", "warning", "can0 is down, 250000 bit/s.",
+                                       "sudo ip link set can0 up type can bitrate 250000")),
+        ("0x40080", 0, "", Finding("can can0", "warning", "can0 is down.",
+                                  "sudo ip link set can0 up type can bitrate 500000")),
+        ("0x40081", 125000, "BUS-OFF", Finding(
+            "can can0", "warning", "can0 is bus-off, 125000 bit/s.",
+            "Check wiring, termination and bit rate; then: sudo ip link set can0 type can restart")),
+    ],
+)  # fmt: skip
+def test_a_can_interface_word_for_word(
+    system: System, monkeypatch: pytest.MonkeyPatch, flags: str, rate: int, state: str, finding: Finding
+) -> None:
+    for name, kind in (("can0", "280"), ("eth0", "1")):
+        folder = system.at(f"/sys/class/net/{name}")
+        folder.mkdir(parents=True)
+        (folder / "type").write_text(f"{kind}\n")
+        (folder / "flags").write_text(f"{flags}\n")
+    monkeypatch.setattr(links, "_bitrate", lambda *_: (rate, state))
+    assert one(links.can_interfaces(system)) == finding
+
+
+def test_a_kernel_without_can_is_no_trouble(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    for known, text in (
+        (True, "no CAN interface"),
+        (False, "no CAN (modprobe can can_raw, where its modules are there)"),
+    ):
+        monkeypatch.setattr(links, "_kernel_can", lambda known=known: known)
+        why = f"The kernel has {text}; other interfaces of --can may still work."
+        assert one(links.can_interfaces(system)) == Finding("can interfaces", "skipped", why)
+
+
+@pytest.mark.parametrize(
+    ("shown", "found"),
+    [
+        ([{"linkinfo": {"info_data": {"state": "BUS-OFF", "bittiming": {"bitrate": 500000}}}}], (500000, "BUS-OFF")),
+        ([{"linkinfo": {"info_data": {}}}], (0, "")),
+        ([{"linkinfo": {}}], (0, "")),
+        ([], (0, "")),
+        ("no list", (0, "")),
+    ],
+)
+def test_bit_rate_and_state_come_from_ip(
+    system: System, monkeypatch: pytest.MonkeyPatch, shown: Any, found: tuple[int, str]
+) -> None:
+    asked: list[list[str]] = []
+
+    def run(words: list[str], **_: Any) -> Any:
+        asked.append(words)
+        return SimpleNamespace(stdout=json.dumps(shown).encode())
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert links._bitrate(replace(system, root=Path("/")), "can0") == found
+    assert asked == [["ip", "-details", "-json", "link", "show", "can0"]]
+    assert links._bitrate(system, "can0") == (0, ""), "another machine's files"
+    assert len(asked) == 1
+
+
+# -- Bluetooth ---------------------------------------------------------------------------------------------------------
+
+
+def adapter(name: str = "hci0", **changes: Any) -> Any:
+    return SimpleNamespace(**{"name": name, "address": "AA:BB", "central": True, "powered": True, "held": 1} | changes)
+
+
+POWER = "bluetoothctl power on; where that is refused: rfkill unblock bluetooth."
+
+
+@pytest.mark.parametrize(
+    ("asked", "found", "expected"),
+    [
+        (None, [adapter()], [("ok", "hci0 (AA:BB) is on, central, 1 connection held: --ble hci0.", "")]),
+        (None, [adapter(held=4)], [("ok", "hci0 (AA:BB) is on, central, 4 connections held: --ble hci0.", "")]),
+        (None, [adapter(held=5)], [("warning", "hci0: 5 connections held; many adapters take 5 to 9.",
+         "Disconnect what is not needed (bluetoothctl devices Connected), or add an adapter")]),
+        (None, [adapter(central=False)], [("warning", "hci0 has no LE central role.",
+         "Use an adapter with Bluetooth 4.0 or later.")]),
+        ("", [adapter(central=False)], [("failed", "hci0 has no LE central role.",
+         "Use an adapter with Bluetooth 4.0 or later.")]),
+        ("hci1", [adapter(powered=False), adapter("hci1", powered=False)],
+         [("warning", "hci0 is switched off.", POWER), ("failed", "hci1 is switched off.", POWER)]),
+        (None, [], [("skipped", "bluetoothd has no adapter.", "")]),
+        ("", [], [("failed", "bluetoothd has no adapter.", "Plug one in; bluetoothctl list")]),
+        ("hci7", [adapter(), adapter("hci1")],
+         [("failed", "There is no Bluetooth adapter hci7.", "There is hci0, hci1.")]),
+    ],
+)  # fmt: skip
+def test_bluetooth_adapters_word_for_word(
+    system: System, monkeypatch: pytest.MonkeyPatch, asked: str | None, found: list[Any], expected: list[Any]
+) -> None:
+    monkeypatch.setattr(links, "adapters", lambda _: found)
+    bus = replace(system, ble=asked, environment={"DBUS_SYSTEM_BUS_ADDRESS": "unix:path=/x"})
+    assert [(each.result, each.why, each.fix) for each in links.bluetooth(bus)] == expected
+    assert one(links.bluetooth(replace(bus, environment={}))).result == "skipped"
+
+
+def test_a_blocked_adapter_says_by_what(system: System) -> None:
+    assert one(links.switches(system)).why == "The kernel has no Bluetooth adapter."
+    (system.at("/sys/class/bluetooth") / "hci0").mkdir(parents=True)
+    (system.at("/sys/class/bluetooth") / "hci0:12").mkdir()
+
+    def switch(number: int, kind: str, soft: str, hard: str) -> None:
+        folder = system.at(f"/sys/class/rfkill/rfkill{number}")
+        folder.mkdir(parents=True)
+        for name, text in {"type": kind, "name": f"switch{number}", "soft": soft, "hard": hard}.items():
+            (folder / name).write_text(f"{text}\n")
+
+    switch(0, "wlan", "1", "1")
+    switch(1, "bluetooth", "0", "0")
+    assert one(links.switches(system)) == Finding("bluetooth switches", "ok", "hci0: not blocked.")
+    switch(2, "bluetooth", "1", "0")
+    switch(3, "bluetooth", "1", "1")
+    assert list(links.switches(system)) == [
+        Finding("bluetooth switches", "warning", "switch2 is blocked.", "rfkill unblock bluetooth"),
+        Finding(
+            "bluetooth switches", "warning", "switch3 is turned off by a switch.", "Use the machine's switch or key."
+        ),
+    ]
+
+
+# -- the machine -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [("1.2.3", (1, 2, 3)), ("8.4.2rc1", (8, 4, 2)), ("2026.1", (2026, 1)), ("1.2.dev3", (1, 2)), ("1.2+x", (1, 2)),
+     ("v1", ()), ("1..2", (1,))],
+)  # fmt: skip
+def test_a_version_is_its_leading_numbers(text: str, numbers: tuple[int, ...]) -> None:
+    assert machine._numbers(text) == numbers
+
+
+@pytest.mark.parametrize(("nfc", "result"), [(None, "warning"), ("udp:x", "warning"), ("usb:x", "failed")])
+def test_a_missing_libusb_hinders_usb_readers_alone(
+    system: System, monkeypatch: pytest.MonkeyPatch, nfc: str | None, result: str
+) -> None:
+    tried: list[str] = []
+
+    def load(name: str) -> Any:
+        tried.append(name)
+        raise OSError
+
+    monkeypatch.setattr(machine.ctypes, "CDLL", load)
+    found = one(machine.libusb(replace(system, nfc=nfc)))
+    assert (found.result, found.fix) == (result, "sudo apt install libusb-1.0-0")
+    assert tried == ["libusb-1.0.so.0", "libusb-1.0.dylib", "libusb-1.0.dll"]
+    monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: name)
+    assert one(machine.libusb(system)) == Finding("libusb", "ok", "libusb-1.0.so.0 loads.")
+
+
+@pytest.mark.parametrize(("year", "result"), [(2024, "failed"), (2025, "ok"), (2099, "ok"), (2100, "failed")])
+def test_a_clock_shows_a_year_between_2025_and_2099(
+    system: System, monkeypatch: pytest.MonkeyPatch, year: int, result: str
+) -> None:
+    moment = machine.datetime(year, 6, 1, 12, 30, tzinfo=machine.UTC)
+    monkeypatch.setattr(machine, "datetime", SimpleNamespace(now=lambda _: moment))
+    found = one(machine.clock(system))
+    assert found.result == result
+    assert found.why == (f"{year}-06-01 12:30 UTC." if result == "ok" else f"The clock is wrong: {year}-06-01.")
+
+
+@pytest.mark.parametrize(("seconds", "result"), [(120, "ok"), (121, "warning"), (-121, "warning"), (3599, "ok")])
+def test_a_hardware_clock_may_run_in_local_time(
+    system: System, monkeypatch: pytest.MonkeyPatch, seconds: int, result: str
+) -> None:
+    clock = system.at("/sys/class/rtc/rtc0/since_epoch")
+    clock.parent.mkdir(parents=True)
+    clock.write_text(f"{1_780_000_000 + seconds}\n")
+    local: Callable[[], Any] = lambda: SimpleNamespace(tm_isdst=0)  # noqa: E731
+    monkeypatch.setattr(
+        machine, "time", SimpleNamespace(time=lambda: 1_780_000_000.0, timezone=-3600, altzone=-7200, localtime=local)
+    )
+    assert one(machine.clock(system)).result == result
+
+
+@pytest.mark.parametrize(
+    ("results", "code"),
+    [
+        ([], 0),
+        ([("store", "warning"), ("link", "skipped"), ("machine", "ok")], 0),
+        ([("machine", "failed")], 1),
+        ([("machine", "failed"), ("link", "failed")], 5),
+        ([("link", "failed"), ("store", "failed"), ("machine", "failed")], 7),
+    ],
+)
+def test_the_exit_code_is_that_of_the_worst_room(results: list[Any], code: int) -> None:
+    assert exit_code([(room, Finding("x", result, "why.")) for room, result in results]) == code
+
+
+def test_a_part_that_was_checked_says_so() -> None:
+    part: Any = SimpleNamespace(sampled=True)
+    assert intact("nodes", "all 3", "2 of 3", part) == Finding(
+        "nodes", "ok", "2 of 3 (doctor --full checks all).", "", sampled=True
+    )
+    whole: Any = SimpleNamespace(sampled=False)
+    assert intact("nodes", "all 3", "2 of 3", whole) == Finding("nodes", "ok", "all 3.")
