@@ -88,7 +88,7 @@ content-nonconformant 2007 3
 error tedsid-first @4 TEDSID <type 3|type 11>
     The TEDSID tuple is not first.
 warning order @13 CalKey <ascending types|10 behind 11>
-    The field 10 CalKey stands behind 11.
+    The field 10 CalKey comes after 11.
 warning repeated @16 ChanType <once|again>
     The field 11 ChanType occurs more than once.
 """,
@@ -188,7 +188,7 @@ note version @9 TEDSID <2|3>
         """\
 clean 2007 12
 warning order @13 Format <ascending types|4 behind 5>
-    The field 4 Format stands behind 5.
+    The field 4 Format comes after 5.
 warning repeated @16 TCName <once|again>
     The field 5 TCName occurs more than once.
 """,
@@ -237,7 +237,7 @@ warning text @13 TCName <UTF-8|e4e4>
         """\
 content-nonconformant 2007 1
 warning order @38 - <ascending types|3 behind 13>
-    The field 3 stands behind 13.
+    The field 3 comes after 13.
 error tedsid-again @38 TEDSID <once|again>
     The type 3 occurs again with 1 octets (clash with the TEDSID).
 """,

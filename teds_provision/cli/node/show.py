@@ -21,6 +21,7 @@ from teds_provision import teds
 from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import ChannelName, FileToRead, command
+from teds_provision.cli.rendering import print_table
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.files import open_to_read, read_limited
 from teds_provision.lazy import late
@@ -259,7 +260,7 @@ def print_teds(console: Console, shown: ShownTeds) -> None:
         table.add_row(*row)
     for octets in decoded.text:
         table.add_row("", "", "text", escape(octets.decode(errors="replace")), "")
-    console.print(table)
+    print_table(console, table)
     _print_findings(console, decoded.findings, "")
 
 
@@ -290,7 +291,7 @@ def _print_message(console: Console, message: Message) -> None:
     for argument in message.arguments:
         table.add_row(str(argument.offset), argument.name, escape(_value(argument)), escape(argument.meaning))
     if message.arguments:
-        console.print(table)
+        print_table(console, table)
     _print_findings(console, message.findings, "")
     for offset, octets in message.teds:
         console.print(f"\nTEDS at octet {offset}:")
@@ -324,7 +325,7 @@ def _print_certificate(console: Console, shown: ShownCertificate) -> None:
         table = rich_table.Table(*_heads(item), box=None, pad_edge=False, header_style="dim")
         for row in teds.dcc.shown.points_of(item):
             table.add_row(*row)
-        console.print(table)
+        print_table(console, table)
         uncertainty = item.to_json()["uncertainty"]
         if isinstance(uncertainty, float):
             console.print(f"  standard uncertainty {uncertainty:.6g} {escape(item.reference.unit.text)}".rstrip())

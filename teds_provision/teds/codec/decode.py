@@ -277,7 +277,7 @@ class _Walk(Head):
         if kind in seen and not (spec is not None and spec.repeats) and kind < MANUFACTURER:
             self.find("warning", "repeated", f"{which} occurs more than once.", at, name, "once", "again")
         if kind < last:
-            message = f"{which} stands behind {last}."
+            message = f"{which} comes after {last}."
             self.find("warning", "order", message, at, name, "ascending types", f"{kind} behind {last}")
 
     def missing(self, seen: set[int], start: int) -> None:
@@ -348,7 +348,7 @@ class _Walk(Head):
         if inner is not None:
             parent = known.parents[kind]
             message = (
-                f"The sub-field {kind} {inner.name} stands at top level; it belongs inside {parent.type} {parent.name}."
+                f"The sub-field {kind} {inner.name} is at top level; it belongs inside {parent.type} {parent.name}."
             )
             self.find("error", "top-level", message, at, inner.name, f"inside {parent.name}", "at top level")
             return self.special(kind, inner, raw, at, body)

@@ -65,7 +65,7 @@ def write_profile(blocks: Sequence[TedsBlock]) -> tuple[str, tuple[str, ...]]:
     decoded = {key: decode(octets) for key, octets in placed.items()}
     body = "\n".join(_lines(decoded)) + "\n"
     lost += _differences(body, placed, decoded)
-    head = ["# Profile made from TEDS. The UUID is the node's and stands in no profile."]
+    head = ["# Profile made from TEDS. The UUID belongs to the node, so a profile has none."]
     head += [f"# Not held here: {sentence}" for sentence in lost]
     return "\n".join(head) + "\n" + body, tuple(lost)
 
