@@ -248,7 +248,7 @@ error tedsid-again @38 TEDSID <once|again>
         """\
 content-nonconformant 2007 3
 error top-level @57 DatModel <inside Sample|at top level>
-    The sub-field 40 DatModel stands at top level; it belongs inside 18 Sample.
+    The sub-field 40 DatModel is at top level; it belongs inside 18 Sample.
 """,
     ),
     (
