@@ -12,6 +12,7 @@ leaves after it before the node has answered a Clock: its counter makes the olde
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -32,6 +33,7 @@ from teds_provision.protocol.operation.stream_commands import CLOCK, DriveReply,
 from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 
+_log = logging.getLogger(__name__)
 DRIVE_ABOVE = 50  # set points a second
 WATCHED = 10  # set points over which their rate is computed
 ECHO = 255  # number of the "stream" for the echo of applied set points; nodes use 0 to 3
@@ -115,6 +117,9 @@ class TopicActuators:
                     self._refuse(f"channel {command.channel}: the session was lost: {lost.cause.message}")
                 except TedsProvisionError as error:
                     self._refuse(f"channel {command.channel}: {error.message}")
+                except Exception as bug:  # noqa: BLE001 - a thread that ends takes no set point any more, without a word
+                    _log.debug("Set point of channel %d failed.", command.channel, exc_info=True)
+                    self._refuse(f"channel {command.channel}: unexpected {type(bug).__name__}, which is a bug")
 
     def _refuse(self, why: str) -> None:
         self.refused += 1

@@ -16,7 +16,15 @@ from urllib.parse import urlsplit
 
 from teds_provision.errors import UsageError
 from teds_provision.measure.display_units import FileUnits
-from teds_provision.measure.sinks import FILES, CommandTaker, Sink, in_units, open_sink, without_scalars
+from teds_provision.measure.sinks import (
+    FILES,
+    CommandTaker,
+    Sink,
+    as_sink_failure,
+    in_units,
+    open_sink,
+    without_scalars,
+)
 from teds_provision.measure.sinks.foxglove import FoxgloveSink
 from teds_provision.measure.sinks.foxglove_server import FoxgloveServer
 from teds_provision.station.store.records import KeptMeasurement
@@ -124,7 +132,10 @@ class DaemonSinks:
 
     def _folder(self) -> Path:
         folder = self._record or self._home / RECORDINGS
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise as_sink_failure(error, str(folder)) from error
         return folder
 
 

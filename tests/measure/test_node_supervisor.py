@@ -9,16 +9,18 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, PolicyError
+from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, PolicyError, StoreError
 from teds_provision.measure import node_supervisor
-from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.blocks import NodeReport, SetPointCommand
 from teds_provision.measure.clock import HostClock
 from teds_provision.measure.node_supervisor import LOOK, NodeSupervisor
 from teds_provision.measure.planning import BusShare
 from teds_provision.measure.request import Events, MeasurementRequest
+from teds_provision.measure.running import measurement_job
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.protocol.messages.frames import Reason
+from teds_provision.station.measurements import STATION
 from teds_provision.station.store.records import KeptMeasurement
 
 UUID = bytes(range(10))
@@ -352,3 +354,105 @@ def test_a_refused_subscribe_is_tried_slower_or_at_once_and_as_at_first_in_the_n
         assert stops == [9] * (len(plans) - 1), "what began of a refused plan is stopped"
         assert raised is None or cast(Any, refused).value.reason == raised
         assert share.taken == {UUID: 0.1}
+
+
+def test_a_measurement_goes_on_after_any_failure_of_a_run_and_of_its_sinks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk, on which the folder of the recordings could not be made, ended it without a word; so did a bug."""
+    now, pauses, made, ran = [0.0], list[float](), list[int](), list[str]()
+    errors: list[Exception | None] = [LinkError("It is away."), ZeroDivisionError(), None, None, LinkError("Again.")]
+
+    def more(_take: object) -> list[Any]:
+        made.append(len(made))
+        if len(made) == 3:
+            raise StoreError("The disk is full.")
+        return [SimpleNamespace(number=made[-1])]
+
+    station: Any = None
+    job = MeasurementJob(station, KeptMeasurement("run", uuids=(UUID,)), more=more)
+
+    def run(*_words: object, **_how: object) -> Any:
+        ran.append(f"sink {cast(Any, job.sinks[0]).number}")
+        now[0] += 31.0 if len(ran) == 3 else 1.0
+        if (error := errors[len(ran) - 1]) is not None:
+            raise error
+        return SimpleNamespace(error=None)
+
+    seen = list[str | None]()
+
+    def wait(seconds: float) -> None:
+        pauses.append(seconds)
+        seen.append(job.error and job.error.message)
+        if len(pauses) == 6:
+            job._stop.set()
+
+    monkeypatch.setattr(measurement_job, "time", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[0]))
+    monkeypatch.setattr(job, "run", run)
+    monkeypatch.setattr(job._stop, "wait", wait)
+    job._carry_on(cast(Any, None), None)
+    assert seen == ["It is away.", "Unexpected ZeroDivisionError.", "The disk is full.", None, None, "Again."]
+    assert pauses == [1.0, 2.0, 4.0, 1.0, 2.0, 4.0], "it begins anew with a run of half a minute"
+    assert ran == ["sink 0", "sink 1", "sink 3", "sink 4", "sink 5"], "new ones for each run"
+
+
+def test_a_measurement_whose_time_is_over_is_kept_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    forgotten = list[str]()
+    station: Any = SimpleNamespace(measurements=SimpleNamespace(forget=forgotten.append))
+    monkeypatch.setattr(measurement_job, "time", SimpleNamespace(monotonic=lambda: 0.0, time=lambda: 100.0))
+    for ends, stops in ((None, True), (100.5, True), (100.0, False)):
+        job = MeasurementJob(station, KeptMeasurement("run", uuids=(UUID,), ends=ends))
+        stopped = list[float]()
+        monkeypatch.setattr(job, "run", lambda *_words, **_how: SimpleNamespace(error=None))
+        monkeypatch.setattr(
+            job._stop, "wait", lambda seconds, job=job, stopped=stopped: (stopped.append(seconds), job._stop.set())
+        )
+        job._carry_on(cast(Any, None), None)
+        assert bool(stopped) is stops
+    assert forgotten == ["run"]
+
+
+@pytest.mark.parametrize(
+    ("kept", "instance"),
+    [
+        (KeptMeasurement("7", group="hand", uuids=(UUID,)), "hand"),
+        (KeptMeasurement("7", uuids=(UUID, bytes(10))), "n00010203"),
+        (KeptMeasurement("7", match="all"), "7"),
+        (KeptMeasurement("7", match="all", frozen=True), ""),
+    ],
+)
+def test_measurements_side_by_side_have_names_of_their_own(kept: KeptMeasurement, instance: str) -> None:
+    station: Any = SimpleNamespace(
+        name="bench",
+        measurements=SimpleNamespace(names={(UUID, 0): "arm", (STATION, 0): "lab"}),
+        nodes=SimpleNamespace(all=lambda: [SimpleNamespace(uuid=UUID, name=None)]),
+    )
+    facts = MeasurementJob(station, kept)._facts()
+    assert (facts.name, facts.instance, facts.names) == ("lab", instance, {(UUID.hex(), 0): "arm"})
+    assert (facts.nodes, facts.group, facts.scalar_rate) == ({UUID.hex(): ""}, kept.group or "", 10.0)
+    assert facts.each_node is (kept.match is not None and not kept.frozen)
+
+
+@pytest.mark.parametrize(
+    ("kept", "admits", "passed"),
+    [(True, True, [0.5]), (True, False, []), (False, True, None), (True, None, None)],
+)
+def test_a_set_point_of_a_topic_passes_if_the_measurement_and_its_owner_let_it(
+    kept: bool, admits: bool | None, passed: list[float] | None
+) -> None:
+    takers, came = list[Any](), list[float]()
+    station: Any = None
+    job = MeasurementJob(
+        station,
+        KeptMeasurement("run", uuids=(UUID,), sinks=("ros2",), actuators=kept),
+        more=lambda take: takers.append(take) or [],
+        admits=None if admits is None else lambda _command: admits,
+        opened=lambda spec, take: takers.append((spec, take)) or cast(Any, None),
+    )
+    (spec, first), second = takers
+    assert (spec, first) == ("ros2", second)
+    assert (first is None) is (passed is None)
+    assert job.request.actuators is (passed is not None)
+    if first is not None:
+        first(SetPointCommand(UUID.hex(), 1, 0.1, 0.0))  # before it runs
+        job._commands = lambda command: came.append(command.value)
+        first(SetPointCommand(UUID.hex(), 1, 0.5, 0.0))
+    assert came == (passed or [])

@@ -180,3 +180,26 @@ def test_a_run_of_drive_that_was_used_before_is_refused() -> None:
     assert (len(scene.messages), scene.node.asked) == (sent, 2)
     assert "no Drive messages" in scene.warnings[0]
     scene.actuators.close()
+
+
+def test_a_bug_with_one_set_point_is_reported_and_the_next_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread ended without a word, and the actuator followed no topic any more until the session was over."""
+    scene, sent = Scene(lambda: reply(1)), scene_send(monkeypatch)
+    scene.give(2)
+    scene.actuators.close()
+    assert scene.warnings == ["set point refused, channel 1: unexpected ZeroDivisionError, which is a bug"]
+    assert (scene.actuators.refused, len(scene.applied), len(sent)) == (1, 1, 2)
+
+
+def scene_send(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Let the first set point that is sent meet a bug, and the later ones none."""
+    sent, send = list[float](), TopicActuators._send
+
+    def fails_once(self: TopicActuators, command: SetPointCommand, actuator: Any, octets: bytes) -> None:
+        sent.append(command.value)
+        if len(sent) == 1:
+            raise ZeroDivisionError
+        send(self, command, actuator, octets)
+
+    monkeypatch.setattr(TopicActuators, "_send", fails_once)
+    return sent

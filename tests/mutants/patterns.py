@@ -1780,6 +1780,27 @@ PATTERNS = (
         "tests/measure/test_looking_out.py",
     ),
     Pattern(
+        "a measurement that failed is begun again a second later",
+        "MeasurementJob._carry_on",
+        "(AGAIN, False)",
+        "(LONGEST, False)",
+        "tests/measure/test_node_supervisor.py",
+    ),
+    Pattern(
+        "a node that two borrow is let go for the first of them",
+        "MeasurementSupervisor.lent_for",
+        "loans[0].why",
+        "loans[-1].why",
+        "tests/ncap/test_supervisor.py",
+    ),
+    Pattern(
+        "a share of the bus is reserved only for a node that finds room",
+        "MeasurementSupervisor._reserve",
+        "not membership.why_no_room(uuid, share.room, running.budget)",
+        "True",
+        "tests/ncap/test_supervisor.py",
+    ),
+    Pattern(
         "strangers never displace a node that is measured",
         "Presence.add_sighting",
         "MOST + len(self._announced)",

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import LinkError, NodeBusyError, NodeRefusedError, PolicyError
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.ncap.nodes import actuator_leases
 from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases, Measured, _HeldActuator, _SetPointOrder
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.provisioning.conversation import SessionLostError
 
 
 class Events:
@@ -148,3 +151,161 @@ def test_a_set_point_whose_time_is_shorter_than_the_way_to_the_node_is_applied_o
     leases._hold(held, session)
     assert applied == [0.5, 0.75, -1.0]
     assert (held.answered, held.let_go, held.safe, standing.drives) == (2, True, True, True)
+
+
+def leases_of(events: Events | None = None, **parts: Any) -> ActuatorLeases:
+    """Return leases with these parts, and none of the others."""
+    none = cast(Any, None)
+    names = ("station", "live", "desk", "turns", "measured", "is_measured", "lent_for")
+    given = {"live": events or Events(), "is_measured": lambda _uuid: False, "lent_for": lambda _uuid: None} | parts
+    return ActuatorLeases(*(cast(Any, given.get(name, none)) for name in names))
+
+
+def test_the_actuators_of_a_node_that_are_held_are_named_in_order() -> None:
+    leases, order = leases_of(), _SetPointOrder(0.0, None, 1)
+    for uuid, channel, ended in (("ab", 3, False), ("ab", 1, False), ("ab", 2, True), ("cd", 4, False)):
+        leases._held[uuid, channel] = _HeldActuator(uuid, channel, 0.0, order, ended=ended)
+    leases._held["ab", 1].let_go = True
+    assert leases.held("ab") == [1, 3]
+    assert leases.held("ef") == []
+
+
+@pytest.mark.parametrize(
+    ("error", "outcome", "why"),
+    [
+        (None, "done", None),
+        (PolicyError("It is too far."), "refused", "It is too far."),
+        (SessionLostError(LinkError("Silent.")), "link", "The session was lost: Silent."),
+        (ZeroDivisionError(), "bug", "Unexpected ZeroDivisionError."),
+    ],
+)
+def test_the_log_has_the_begin_and_the_end_of_a_lease_and_how_it_ended(
+    error: Exception | None, outcome: str, why: str | None
+) -> None:
+    """A bug was logged as done."""
+    log, events = list[tuple[Any, ...]](), Events()
+
+    def audit(act: str, node: bytes, outcome: str, **facts: object) -> None:
+        log.append((act, node, outcome, facts))
+
+    class Leases(ActuatorLeases):
+        @contextmanager
+        def _session(self, uuid: str) -> Iterator[Measured]:
+            yield cast(Measured, None)
+
+        def _hold(self, held: _HeldActuator, session: Measured) -> None:
+            held.order, held.safe = _SetPointOrder(0.75, "mm", 2), True
+            if error is not None:
+                raise error
+
+    none = cast(Any, None)
+    leases = Leases(cast(Any, SimpleNamespace(audit=audit)), cast(Any, events), none, none, none, none, none)
+    held = leases._held["ab", 1] = _HeldActuator("ab", 1, 0.0, _SetPointOrder(0.5, None, 1))
+    leases._run(held, 0.5, None)
+    reason = {} if why is None else {"why": why}
+    assert log == [
+        ("set", b"\xab", "begun", {"value": 0.5, "unit": "", "channel": 1}),
+        ("set", b"\xab", outcome, {"safe": True, "value": 0.75, "unit": "mm", "channel": 1} | reason),
+    ]
+    assert (held.ended, held.let_go, leases._held, events.states) == (True, True, {}, ["released"])
+    assert leases.state("ab", 1) == {"value": None, "unit": None, "safe": True}
+    assert leases.release_actuator("ab", 1) == {"applied": None, "until": None, "safe": True}
+    assert leases.release_actuator("ab", 2) == {"applied": None, "until": None, "safe": None}
+
+
+def test_the_end_of_a_lease_leaves_the_one_that_took_its_place() -> None:
+    leases = leases_of(station=SimpleNamespace(audit=lambda *_words, **_facts: None))
+    order = _SetPointOrder(0.5, None, 1)
+    after = leases._held["ab", 1] = _HeldActuator("ab", 1, 0.0, order)
+    leases._run(_HeldActuator("ab", 1, 0.0, order), 0.5, None)
+    assert leases._held == {("ab", 1): after}
+
+
+@pytest.mark.parametrize(
+    ("answered", "mine", "facts", "raised"),
+    [
+        (1, 1, {}, None),
+        (2, 1, {}, None),
+        (1, 2, {}, LinkError),
+        (1, 2, {"let_go": True}, NodeBusyError),
+        (2, 2, {"let_go": True}, None),
+        (1, 1, {"applied": None}, LinkError),
+        (1, 2, {"error": PolicyError("No.")}, PolicyError),
+        (2, 1, {"error": PolicyError("No.")}, None),
+    ],
+)
+def test_a_request_is_answered_by_its_own_set_point(
+    answered: int, mine: int, facts: dict[str, Any], raised: type[Exception] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(actuator_leases, "time", SimpleNamespace(monotonic=lambda: 100.0, time=lambda: 5000.0))
+    order = _SetPointOrder(0.5, None, 1)
+    held = _HeldActuator("ab", 1, 0.0, order, **{"applied": {"value": 0.5}, "answered": answered} | facts)
+    if raised is not None:
+        with pytest.raises(raised):
+            ActuatorLeases._answer(held, mine, 0.25)
+        return
+    assert ActuatorLeases._answer(held, mine, 0.25) == {"applied": {"value": 0.5}, "until": 5000.25, "safe": False}
+    assert held.until == 100.25
+
+
+def test_an_actuator_off_the_whitelist_is_not_moved_and_the_log_has_who_tried() -> None:
+    log = list[tuple[Any, ...]]()
+    station = SimpleNamespace(
+        pins=SimpleNamespace(entry=lambda _uuid: None),
+        audit=lambda act, node, outcome, **facts: log.append((act, node, outcome, facts)),
+    )
+    with pytest.raises(PolicyError, match="is not on the whitelist, so its actuators are not moved") as refused:
+        leases_of(station=station).put("ab", 1, 0.5, None, None)
+    facts = {"channel": 1, "value": 0.5, "unit": "", "why": refused.value.message}
+    assert log == [("set", b"\xab", "refused", facts)]
+
+
+@pytest.mark.parametrize(("hold", "seconds"), [(None, 1.0), (0.3, 0.3), (100.0, 60.0)])
+def test_a_set_point_is_held_for_a_second_or_as_long_as_was_asked_but_a_minute_at_most(
+    hold: float | None, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[float]()
+    leases = leases_of(station=SimpleNamespace(pins=SimpleNamespace(entry=lambda _uuid: object())))
+    held = _HeldActuator("ab", 1, 0.0, _SetPointOrder(0.5, None, 1), applied={"value": 0.5}, answered=1)
+
+    def ordered(_uuid: str, _channel: int, _value: float, _unit: str | None, seconds: float) -> tuple[Any, int]:
+        asked.append(seconds)
+        return held, 1
+
+    monkeypatch.setattr(leases, "_ordered", ordered)
+    leases.put("ab", 1, 0.5, None, hold)
+    assert asked == [seconds]
+
+
+@pytest.mark.parametrize(
+    ("reason", "again", "raised"),
+    [
+        (None, False, None),
+        (Reason.WRONG_STATE, True, None),
+        (Reason.WRONG_STATE, False, NodeBusyError),
+        (Reason.BUSY, False, NodeRefusedError),
+    ],
+)
+def test_an_actuator_that_a_topic_moves_is_busy(
+    reason: Reason | None, again: bool, raised: type[Exception] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course = list[str]()
+
+    class Actuator:
+        def __init__(self, _trusted: object, channel: int, *, unit: str | None, dead_man: int) -> None:
+            course.append(f"{channel} {unit} {dead_man}")
+
+        def octets_of(self, value: float) -> bytes:
+            course.append(f"limits of {value}")
+            return b""
+
+        def __enter__(self) -> None:
+            course.append("claimed")
+            if reason is not None:
+                raise NodeRefusedError("No.", reason=reason)
+
+    monkeypatch.setattr(actuator_leases, "HeldActuator", Actuator)
+    order = _SetPointOrder(0.5, "mm", 1)
+    with pytest.raises(raised) if raised is not None else nullcontext():
+        leases_of()._claimed(cast(Any, None), _HeldActuator("ab", 1, 0.0, order), order, again=again)
+    assert course == ["1 mm 1000", "limits of 0.5", *([] if again else ["claimed"])]

@@ -9,7 +9,14 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import LinkError, NoRoomError, PolicyError, TedsProvisionError
+from teds_provision.errors import (
+    BadDataError,
+    LinkError,
+    NoRoomError,
+    NotAuthenticError,
+    PolicyError,
+    TedsProvisionError,
+)
 from teds_provision.measure.matching import NodeLoad
 from teds_provision.ncap.membership import (
     AGAIN,
@@ -178,3 +185,93 @@ def test_a_node_joins_only_as_far_as_bus_and_budget_have_room() -> None:
     assert membership.why_no_room(B, 0.001, Budget()) == NO_ROOM
     assert "150" in membership.why_no_room(B, 0.5, budget)
     assert membership.why_no_room(B, 0.5, dataclasses.replace(budget, limit=200.0)) == ""
+
+
+@pytest.mark.parametrize(
+    ("members", "came", "before", "after"),
+    [
+        ((C,), [10.0], 10.04, 10.06),
+        ((C,), [10.0, 10.04], 10.08, 10.1),
+        ((C,), [10.0, 10.04, 10.08, 10.12, 10.16, 10.2, 10.24, 10.28], 10.29, 10.31),
+        ((), [10.0], 10.24, 10.26),
+        ((), [10.0, 10.2], 10.29, 10.31),
+        ((), [0.1], 0.34, 0.36),
+        ((), [0.2 * step for step in range(1, 15)], 2.99, 3.0),
+        ((), [2.9, 3.1], 3.14, 3.35),
+    ],
+    ids=[
+        "one",
+        "two",
+        "a crowd",
+        "the first one",
+        "a crowd of first ones",
+        "at the start",
+        "for three seconds",
+        "late",
+    ],
+)
+def test_how_long_nodes_that_come_are_gathered(
+    members: tuple[str, ...], came: list[float], before: float, after: float
+) -> None:
+    """In seconds: 0.05 after the last one and 0.3 after the first; 0.25 if none is in; three seconds at the start."""
+    membership = joined(*members)
+    for number, at in enumerate(came):
+        membership.arrive(f"{number:020x}", at)
+    now = before if came[0] != 2.9 else 3.0 - 1e-6
+    assert not membership.gathered(now)
+    assert membership.gathered(after)
+
+
+def test_a_lost_node_is_asked_after_a_fifth_of_a_second_and_then_after_twice_as_long_each_time() -> None:
+    membership, last = joined(A), place()
+    released(membership, A)
+    membership.end(A, 1000.0, LinkError("silent"), last=last, seen=last, room=0.0)
+    for number, at in enumerate((0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 41.6, 57.6), 1):
+        assert membership.ask_now(1000.0 + at - 0.01) == []
+        assert membership.ask_now(1000.0 + at + 0.001 * number) == [last]
+    assert (membership.ask_now(1060.0), A in membership.lost) == ([], True)
+    assert (membership.ask_now(1060.01), A in membership.lost) == ([], False)
+
+
+@pytest.mark.parametrize(
+    ("error", "seen", "waits"),
+    [
+        (NoRoomError("full"), True, (1030.0, 0.25)),
+        (NoRoomError("full"), False, (1030.0, None)),
+        (PolicyError("banned"), True, (1030.0, None)),
+        (NotAuthenticError("forged"), False, (1030.0, None)),
+        (BadDataError("no sensor"), True, (1030.0, None)),
+        (LinkError("silent"), True, None),
+        (None, True, None),
+    ],
+)
+def test_a_node_that_is_refused_or_finds_no_room_waits_half_a_minute(
+    error: TedsProvisionError | None, seen: bool, waits: tuple[float, float | None] | None
+) -> None:
+    membership, last = joined(A), place()
+    released(membership, A)
+    membership.end(A, 1000.0, error, last=last, seen=last if seen else None, room=0.25)
+    found = membership.waits.get(A)
+    assert (found and (found.at, found.room)) == waits
+
+
+@pytest.mark.parametrize(
+    ("bus", "room", "budget", "why"),
+    [
+        (25.0, 0.5, Budget(), ""),
+        (25.1, 0.5, Budget(), "no room on the bus"),
+        (None, 0.0, Budget(), ""),
+        (0.1, 0.0, Budget(), "no room on the bus"),
+        (0.1, 0.5, Budget(80.0, 10.0), ""),
+        (0.1, 0.5, Budget(79.0, 10.0), "no room in the budget of 79 messages/s"),
+        (0.1, 0.5, Budget(280.0, 10.0, rows=True), ""),
+        (0.1, 0.5, Budget(279.0, 10.0, rows=True), "no room in the budget of 279 messages/s"),
+    ],
+)
+def test_a_new_node_may_be_slowed_to_a_fiftieth_and_the_messages_of_all_count(
+    bus: float | None, room: float, budget: Budget, why: str
+) -> None:
+    membership = joined(A, B)
+    membership.members[A].load = NodeLoad(0.2, 3, 50.0)
+    membership.members[B].load = NodeLoad(bus, 5, 50.0)
+    assert membership.why_no_room(B, room, budget) == why

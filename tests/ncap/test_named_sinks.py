@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from teds_provision.cli.config_file import brokers_of
 from teds_provision.client import ApiError
-from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
+from teds_provision.errors import BadDataError, StoreError, TedsProvisionError, UsageError
 from teds_provision.ncap.sinks import DaemonSinks, for_readers
 from teds_provision.station.store.records import KeptMeasurement
 from tests.e2e.desk import Desk
@@ -124,3 +125,53 @@ def test_a_running_daemon_takes_the_names_of_its_owner(desk: Desk) -> None:
         assert str(station.home) not in str(eye.request("GET", "/status"))
         asked.end_measurement(made["id"])
     service.end()
+
+
+def test_a_folder_of_recordings_that_cannot_be_made_is_reported_as_any_failure_of_a_disk(tmp_path: Path) -> None:
+    """A full disk refused the folder with an error that ended the measurement for good."""
+    (tmp_path / "recordings").write_text("")
+    with pytest.raises(StoreError, match="recordings cannot be written: File exists"):
+        DaemonSinks(tmp_path, actuators=True).whole("run.csv")
+
+
+@pytest.mark.parametrize(
+    ("kept", "name"),
+    [
+        (KeptMeasurement("7", group="left arm/2"), "left_arm_2"),
+        (KeptMeasurement("7", group="Arm-1_b"), "Arm-1_b"),
+        (KeptMeasurement("7", match="all"), "7"),
+        (KeptMeasurement("7", group="a" * 80), "a" * 60),
+        (KeptMeasurement(""), "measurement"),
+    ],
+)
+def test_each_measurement_is_recorded_under_its_name_and_its_time(
+    tmp_path: Path, kept: KeptMeasurement, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("teds_provision.ncap.sinks.time", SimpleNamespace(strftime=lambda form: f"now {form}"))
+    sinks = DaemonSinks(tmp_path, ("ros2",), tmp_path / "kept", actuators=True)
+    ros, file = sinks.extra_sinks(kept, None)
+    assert (ros.name, Path(file.name).name) == ("ROS 2", f"{name}-now %Y%m%d-%H%M%S.csv")
+    assert (tmp_path / "kept").is_dir()
+    assert not (tmp_path / "recordings").exists()
+    assert sinks.whole("run.mcap") == str(tmp_path / "kept" / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("daemon", "actuators", "kept", "named", "allowed", "takes", "publishes"),
+    [
+        (("ros2",), True, True, (), True, True, True),
+        (("ros1",), True, True, ("run.csv",), True, True, True),
+        (("mqtt://own",), True, True, (), False, False, True),
+        (("mqtt://own",), True, True, ("ros1",), True, False, True),
+        ((), True, True, ("ros2",), True, False, False),
+        (("ros2",), False, True, (), False, False, True),
+        (("ros2",), True, False, (), False, True, True),
+    ],
+)
+def test_set_points_come_by_a_topic_of_ros_if_daemon_and_measurement_let_them(
+    tmp_path: Path, daemon: tuple[str, ...], actuators: bool, kept: bool, named: tuple[str, ...],
+    allowed: bool, takes: bool, publishes: bool,
+) -> None:  # fmt: skip
+    sinks = DaemonSinks(tmp_path, daemon, actuators=actuators)
+    assert sinks.allows_set_points(KeptMeasurement("m", sinks=named, actuators=kept)) is allowed
+    assert (sinks.take_set_points, sinks.publish) == (takes, publishes)

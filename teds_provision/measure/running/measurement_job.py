@@ -16,6 +16,7 @@ reader removes it; `measure NAME` without options continues with its settings.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import InternalError, TedsProvisionError
 from teds_provision.measure.blocks import SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest, Requirements
@@ -37,6 +38,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.teds.fits import parse_require
 
+_log = logging.getLogger(__name__)
 AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole is started again
 
 
@@ -166,10 +168,13 @@ class MeasurementJob:
         return self._thread is not None and self._thread.is_alive()
 
     def _carry_on(self, buses: Buses, watcher: Watcher | None) -> None:
-        pause = AGAIN
+        pause, again = AGAIN, False
         while not self._stop.is_set():
             began = time.monotonic()
             try:
+                if again:  # in here: their folder may be gone, or the disk full, for as long as the run fails for that
+                    self.sinks = self._new_sinks()
+                again = True
                 self.ended = self.run(buses, self._stop, watcher=watcher)
                 self.error = self.ended.error
                 if self.kept.ends is not None and self.kept.ends <= time.time():
@@ -177,11 +182,15 @@ class MeasurementJob:
                     return
             except TedsProvisionError as error:
                 self.error = error
+            except Exception as bug:  # noqa: BLE001 - a thread that ends without a word looks like an end in order
+                _log.exception("Measurement %s failed.", self.kept.id)
+                self.error = InternalError(
+                    f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv."
+                )
             if time.monotonic() - began > LONGEST:
                 pause = AGAIN
             self._stop.wait(pause)
             pause = min(2 * pause, LONGEST)
-            self.sinks = self._new_sinks()
 
     def _began(self, duration: float | None) -> None:
         """Store the end, which is known from its first value on, so that a restart does not move it."""

@@ -8,6 +8,7 @@ it, and when the daemon dies the node's dead-man does (operation.md section 2). 
 from __future__ import annotations
 
 import contextvars
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -30,11 +31,12 @@ from teds_provision.measure.held_actuator import HeldActuator
 from teds_provision.measure.standing import NodeStanding, require_whitelisted
 from teds_provision.measure.verified_session import DEAD_MAN, VerifiedSession, open_trusted
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
+from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks, as_program_error
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.station import Station
 
+_log = logging.getLogger(__name__)
 HOLD: Final = 1.0  # seconds, if a request has none
 _STARTING: Final = 15.0
 _OPENING, _LOOK = 5.0, 0.05  # seconds to wait for a session that is being opened, and between checks of it
@@ -219,6 +221,9 @@ class ActuatorLeases:
             held.error = LinkError(f"The session was lost: {lost.cause.message}", hint="It goes to its safe state.")
         except TedsProvisionError as error:
             held.error = error
+        except Exception as bug:  # noqa: BLE001 - a thread has no caller to raise to, and this is no end in order
+            _log.exception("Holding actuator %d of node %s failed.", held.channel, held.uuid)
+            held.error = as_program_error(bug)
         finally:
             outcome = "done" if held.error is None else held.error.code
             with suppress(StoreError):  # a full disk must not keep callers waiting

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -270,3 +270,64 @@ def test_a_report_after_rows_of_a_node_belongs_to_this_file() -> None:
     for samples, lost in ((5, 2), (10, 3)):
         summary.add_entry(NodeReport(ARM, "running", "", samples, lost, 0, 0, 0))
     assert summary._of_this_file(summary.reports[ARM]) == summary.reports[ARM]
+
+
+def test_what_a_recording_holds_is_shown_whole() -> None:
+    """`record info --json`: all of it, of two nodes, one of which was measured in an earlier part already."""
+    summary = RecordingSummary()
+    summary.add_entry((replace(ANGLE, name="angle 2"),))
+    summary.add_entry(NodeReport(ARM, "running", samples=100, lost=5, late=1, bad=2, invalid=3))
+    summary.add_entry(block([[1], [2]], valid=[[True], [False]], index=200))
+    summary.add_entry(block([[4], [0.5]], index=205))
+    summary.add_entry(block([[3]], index=0))
+    summary.add_entry(block([[3]], index=3))
+    summary.add_entry(NodeReport(HAND, "waiting", bad=4))
+    summary.add_entry(block(np.array([[7, 70]]), uuid=HAND, channels=(2, 3), start=1_794_999_999.0))
+    summary.add_entry(block(np.zeros((0, 1)), uuid=HAND, channels=(4,)))
+    summary.add_entry(NodeReport(ARM, "lost", "It is silent.", samples=105, lost=8, late=1, bad=3, invalid=4))
+    summary.add_entry(NodeReport(HAND, "ended", samples=2, bad=4))
+    summary.add_entry(Note(1_795_000_001.0, "The disk was full."))
+    recording: Any = SimpleNamespace(
+        path=Path("/r/run.csv"), form="CSV", station=STATION, complete=True, torn=0, being_written=False,
+        facts={FORCE.key: FORCE, ANGLE.key: ANGLE},
+    )  # fmt: skip
+    shown = summary.to_json(recording)
+    channels = shown.pop("channels")
+    assert shown == {
+        "file": "/r/run.csv",
+        "format": "CSV",
+        "station": "bench",
+        "group": "crane",
+        "started": "2026-11-18T11:06:40.000Z",
+        "test_pattern": False,
+        "complete": True,
+        "being_written": False,
+        "torn": 0,
+        "from": "2026-11-18T11:06:39.000Z",
+        "until": "2026-11-18T11:06:42.060Z",
+        "messages": 7,
+        "samples": 8,
+        "invalid": 1,
+        "lost": 3,
+        "missing": 5,
+        "nodes": [
+            {"uuid": ARM, "state": "lost", "why": "It is silent.", "samples": 5, "lost": 3, "late": 0, "bad": 1,
+             "invalid": 1},
+            {"uuid": HAND, "state": "ended", "why": "", "samples": 2, "lost": 0, "late": 0, "bad": 4, "invalid": 0},
+        ],
+        "notes": [{"time": "2026-11-18T11:06:41.000Z", "why": "The disk was full."}],
+    }  # fmt: skip
+    names = ("channel", "uuid", "name", "unit", "from", "until", "samples", "invalid", "lowest", "highest")
+    begin = "2026-11-18T11:06:39.000Z"
+    assert [tuple(channel.get(name) for name in names) for channel in channels] == [
+        (1, ARM, "angle 2", "rad", "2026-11-18T11:06:40.000Z", "2026-11-18T11:06:42.060Z", 6, 1, 0.05, 0.4),
+        (2, HAND, "force", "N", begin, begin, 1, 0, 0.7, 0.7),
+        (3, HAND, None, None, begin, begin, 1, 0, 7.0, 7.0),
+    ]
+    for complete, torn in ((False, 0), (True, 9)):
+        cut = SimpleNamespace(**{**vars(recording), "complete": complete, "torn": torn})
+        assert summary.to_json(cast(Any, cut))["complete"] is False
+    empty = RecordingSummary().to_json(recording)
+    assert [empty[name] for name in ("from", "until", "lost", "nodes", "samples")] == [None, None, None, [], 0]
+    alone = empty["channels"][-1]
+    assert [alone[name] for name in names[4:]] == [None, None, 0, 0, None, None]
