@@ -13,6 +13,12 @@ from teds_provision.plant.transport import Transport
 from teds_provision.station.station import Station
 
 
+def place_of(station: Station) -> str | None:
+    """Return where the joined registry is, as the store has it now; None if none was joined, or it is unknown."""
+    record = station.plant.joined
+    return record.url if record is not None else None
+
+
 def open_transport(station: Station) -> Transport | None:
     """Return the transport of the joined registry; None if it is unknown. Opens no connection."""
     record = station.plant.joined

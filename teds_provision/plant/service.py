@@ -226,7 +226,7 @@ class PlantWatch:
         """Run one sync; True if another command of this home runs one."""
         station = self._station
         try:
-            self._follow(self._named_place())
+            self._follow(plant.connecting.place_of(self._station))
             if self._transport is None:
                 self._transport = plant.connecting.open_transport(station)
             if self._transport is None:
@@ -248,10 +248,6 @@ class PlantWatch:
         else:
             self._after(done.pushed + done.fetched + done.parcels_in + done.parcels_out + len(done.rosters))
         return False
-
-    def _named_place(self) -> str | None:
-        record = self._station.plant.joined
-        return record.url if record is not None else None
 
     def _follow(self, place: str | None) -> None:
         """Let go of the connections to another place than this."""
@@ -297,7 +293,7 @@ class PlantWatch:
         """Start a sync when the registry notifies of a change."""
         while not self._stop.is_set():
             try:
-                place = self._named_place()
+                place = plant.connecting.place_of(self._station)
                 if self._listener is not None:
                     self._listener.close()
                 self._listener = plant.connecting.listener(self._station)
@@ -307,7 +303,7 @@ class PlantWatch:
                 self._listener.listen()
                 self._wake.set()  # finds what was pushed before
                 swept = 0.0
-                while not self._stop.is_set() and self._named_place() == place:
+                while not self._stop.is_set() and plant.connecting.place_of(self._station) == place:
                     if time.monotonic() - swept >= EVERY:  # also detects a lost connection
                         self._listener.sweep()
                         swept = time.monotonic()

@@ -273,6 +273,29 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     assert "nothing received" not in owner.run("job", "status", made["id"], tmp_path / "proof").out
 
 
+def test_an_office_follows_the_registry_to_another_place(
+    desk: Desk, owner: Station, west: Station, tmp_path: Path
+) -> None:
+    """It went on looking at the old one without a word, and the line waited."""
+    old, new, job = tmp_path / "old", tmp_path / "new", tmp_path / "one.jws"
+    old.mkdir()
+    new.mkdir()
+    for station in (owner, west):
+        station.ask("registry", "connect", "--files", old, "--yes")
+        station.run("registry", "sync")
+    more = ("--count", 1, "--output", job, "--sign", "owner")
+    made = owner.ask("job", "new", "--title", "one", "--profile", ANGLE, "--station", "west", *ENDS, *more)
+    office = owner.start("signer", "run", "--job", made["id"])
+    office.wait_for("Signing for 1 job")
+    for station in (owner, west):
+        station.ask("registry", "connect", "--files", new, "--yes")
+    node = desk.node().start()
+    assert west.provision("nfc", "--job", job)["verdict"] == "authentic"
+    office.wait_for(node.uuid)
+    office.signal(15)
+    assert office.end().code == 0
+
+
 def test_an_office_waits_while_its_folder_or_registry_is_out_of_reach(
     desk: Desk, owner: Station, west: Station, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
     from teds_provision.plant.office import AnsweredRequest
+    from teds_provision.plant.transport import Transport
     from teds_provision.plant.verify_evidence import JudgedEvidence
     from teds_provision.plant.yield_stats import StationYield
     from teds_provision.protocol.plant import document, signing
@@ -442,10 +444,9 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station = app.station()
     ids = {plant.jobs.find_job(station, job).id for job in jobs}
     station.unlock()
-    transport = plant.sign_requests.transport_for(station, files)
-    app.closing(transport.close)
-    inbox = plant.sign_requests.Inbox(station, transport, document.SIGN_REQUEST)
-    app.closing(inbox.close)
+    opened = ExitStack()
+    app.closing(opened.close)
+    place, transport, inbox = _office_inbox(station, files, opened)
     stop = provisioning.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
     if seconds is not None:
@@ -454,6 +455,9 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     again = 0.0  # seconds to the next try; 0 while requests arrive
     while not stop.is_set():
         station.unlock()  # ends with vault-locked if another command changed passphrase and master key
+        if files is None and plant.connecting.place_of(station) != place:  # registry connect named another one
+            opened.close()
+            place, transport, inbox = _office_inbox(station, files, opened)
         try:
             for answered in plant.office.answer_all(station, transport, inbox, ids, stop=stop.is_set):
                 _print_answer(app, station, answered)
@@ -469,6 +473,18 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
                 again = 0.0
             if not stop.is_set():
                 inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
+
+
+def _office_inbox(
+    station: Station, files: Path | None, opened: ExitStack
+) -> tuple[str | None, Transport, plant.sign_requests.Inbox]:
+    """Return the joined place, the transport, and the inbox of requests; ``opened`` closes both."""
+    place = plant.connecting.place_of(station)
+    transport = plant.sign_requests.transport_for(station, files)
+    opened.callback(transport.close)
+    inbox = plant.sign_requests.Inbox(station, transport, document.SIGN_REQUEST)
+    opened.callback(inbox.close)
+    return place, transport, inbox
 
 
 @command(
