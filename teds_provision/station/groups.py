@@ -87,9 +87,10 @@ class Groups:
         if present is not None and set(present.uuids) != set(uuids):
             raise UsageError(f"Group {name!r} already exists.", hint=f"Add nodes to it: group add {quote(name)} UUID …")
         if present is None:
+            each = tuple(dict.fromkeys(uuids))
             with self._store.together():
-                self.put(Group(name, tuple(dict.fromkeys(uuids))))
-                self._report_member(name, uuids, member=True)
+                self.put(Group(name, each))
+                self._report_member(name, each, member=True)
         return self.get(name)
 
     def add(self, name: str, uuids: Iterable[bytes]) -> Group:

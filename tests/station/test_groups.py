@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -87,7 +88,7 @@ def test_a_group_is_made_once_with_its_members_and_reported(station: Station, re
     groups.create("arm", [])
     assert members(station) == {"arm": (), "hand": (A, B)}
     assert [group.name for group in groups.all()] == ["arm", "hand"]
-    assert set(reports) == {("grouped", A, "hand", True), ("grouped", B, "hand", True)}
+    assert reports == [("grouped", B, "hand", True), ("grouped", A, "hand", True)]
 
 
 def test_who_is_added_or_taken_out_is_reported_once_and_only_if_that_changed_something(
@@ -165,6 +166,14 @@ def test_a_group_that_is_measured_is_not_changed_until_that_ends(station: Statio
     assert reports == [("grouped", B, "arm", True)]
     groups.add("hand", [C])
     assert members(station)["hand"] == (A, C)
+
+
+def test_nothing_is_held_for_a_group_that_is_not_there(station: Station, home: Path) -> None:
+    for change in (station.groups.add, station.groups.remove):
+        with pytest.raises(NotFoundError):
+            change("hand", [A])
+    assert not station.groups.delete("hand")
+    assert list(home.glob("measuring-*")) == []
 
 
 def test_what_comes_from_a_backup_or_a_bundle_is_not_reported(station: Station, reports: list[Report]) -> None:

@@ -48,6 +48,7 @@ def test_parcels_are_kept_by_direction_and_state_the_oldest_first(station: Stati
     assert (parcels.get("p1", "out"), parcels.document("p1", "out")) == (replace(late, expires=EARLY), b"again")
     parcels.drop("p1", "out")
     assert [parcels.get("p1", "out"), parcels.get("p1", "in")] == [None, replace(came, detail="")]
+    assert parcels.review() is None
     parcels.put_review("a")
     parcels.put_review("b")
     assert parcels.review() == "b"
@@ -88,6 +89,7 @@ def test_what_became_of_the_copies_of_a_parcel(station: Station) -> None:
     station.keys.remove_key(B, f"{B[0]:016x}")
     station.keys.remove_key(A, f"{A[0]:016x}")
     station.keys.add(KeyRecord(A, 1, f"{A[0]:016x}", "pending", 2, b"w", "agreement", EARLY))
+    station.keys.add(KeyRecord(A, 2, f"{9:016x}", "active", 1, b"w", "agreement", EARLY))
     assert parcels.receipted() == [], "a key that is gone, or not proven, is not forgotten again"
     parcels.forget_shared("p1")
     assert parcels.shared_in("p1") == [(A, 1, "taken"), (B, 1, "taken")]
@@ -142,14 +144,14 @@ def test_of_the_heads_that_a_station_reports_the_greatest_of_each_chain_is_kept(
     pages = station.plant.pages
     south, north = pages.chain(SOUTH).id, pages.chain(NORTH).id
     pages.put_heads(south, {NORTH: (5, H1), WEST: (2, H2)})
-    pages.put_heads(south, {NORTH: (4, H2), WEST: (3, H3)})
+    pages.put_heads(south, {NORTH: (4, H2), WEST: (9, H3)})
     pages.put_heads(south, {NORTH: (5, H3)})
-    pages.put_heads(north, {WEST: (9, H1), SOUTH: (3, H2)})
-    assert pages.heads() == [(SOUTH, NORTH, 5, H1), (NORTH, SOUTH, 3, H2), (NORTH, WEST, 9, H1), (SOUTH, WEST, 3, H3)]
+    pages.put_heads(north, {WEST: (3, H1), SOUTH: (3, H2)})
+    assert pages.heads() == [(SOUTH, NORTH, 5, H1), (NORTH, SOUTH, 3, H2), (SOUTH, WEST, 9, H3), (NORTH, WEST, 3, H1)]
     assert pages.seen_heads() == set()
     pages.see_heads(pages.heads()[:2])
     pages.see_heads(pages.heads()[1:3])
-    assert pages.seen_heads() == {(NORTH, SOUTH, 3, H2), (NORTH, WEST, 9, H1)}
+    assert pages.seen_heads() == {(NORTH, SOUTH, 3, H2), (SOUTH, WEST, 9, H3)}
 
 
 # -- what the pages say ------------------------------------------------------------------------------------------------
