@@ -13,7 +13,13 @@ from teds_provision.measure.matching import NodeMatch, survey
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.virtual import VirtualNode
-from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
+from teds_provision.provisioning.adoption import (
+    FactoryDatasheet,
+    NotAdoptedError,
+    read_factory_datasheet,
+    refuse_adoption,
+    require_a_reason,
+)
 from teds_provision.provisioning.agree import require_session, reset_node
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.calibration_guard import guard
@@ -236,3 +242,110 @@ def test_two_hundred_channels_are_shown_and_signed(station: Station, tmp_path: P
 def test_adopt_and_a_profile_exclude_each_other(station: Station, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--adopt"):
         adopted(station, board(tmp_path / "n", factory()), BuildOrder(ANGLE, adopt=True))
+
+
+def test_what_is_judged_of_a_datasheet_that_was_brought_in_whole_words(station: Station) -> None:
+    good = read_factory_datasheet(station, Image(UUID, factory()))
+    assert (good.name, len(good.channels), good.errors, good.findings) == ("joint", 1, (), [])
+    two_turns = read_factory_datasheet(station, Image(UUID, factory(slope=800.0)))
+    assert [finding["severity"] for finding in two_turns.findings] == ["error"]
+    assert two_turns.findings[0]["message"].startswith("channel 1: ")
+    bare = {place: octets for place, octets in factory().items() if place[1] != 5}
+    warned = read_factory_datasheet(station, Image(UUID, bare))
+    assert warned.errors == ()
+    assert "Channel 1 has no calibration: raw values cannot be turned into °." in warned.warnings
+    renamed = read_factory_datasheet(station, Image(UUID, named(factory(), 0, "x" * 121)), name="mine")
+    assert renamed.name == "mine", "the name that is replaced is not judged"
+    full = read_factory_datasheet(station, Image(UUID, named(factory(), 1, "ä" * 60)))
+    assert full.channels[0].name == "ä" * 60
+    assert (0, 128) not in read_factory_datasheet(station, Image(UUID, {**factory(), (0, 128): b"x"})).image.blocks
+
+
+@pytest.mark.parametrize(
+    ("blocks", "message"),
+    [
+        (
+            {**factory(), (0, 12): factory()[0, 12][:-1] + b"\0"},
+            "TEDS 12 of channel 0 is damaged, or is one that no node",
+        ),
+        ({**factory(), (1, 12): factory()[1, 3]}, "TEDS 12 of channel 1 is damaged, or is one that no node can store"),
+        (named(factory(), 0, "x" * 121), "the name in its XdcrName has more than 120 octets"),
+        (named(factory(), 1, "x" * 121), "the name in its XdcrName of channel 1 has more than 120 octets"),
+        (named(factory(), 1, "a\tb"), "TCName in its XdcrName of channel 1 contains unprintable characters"),
+        (
+            {**factory(), (0, 12): teds.compose(12, [("Format", 0), ("TCName", b"\xff")])},
+            "the name in its XdcrName is no text",
+        ),
+        (
+            {**factory(), (1, 4): teds.compose(4, [("Text", {"LangCode": "en", "Text": "<a>\x07</a>"})])},
+            "a text in its ChanIdTEDS of channel 1 contains unprintable characters",
+        ),
+        (factory(bytes.fromhex("0badc0de5281f7000001")), "it belongs to node 0badc0de5281f7000001"),
+    ],
+)
+def test_why_a_datasheet_that_was_brought_is_not_signed_in_whole_words(
+    station: Station, blocks: dict[BlockId, bytes], message: str
+) -> None:
+    with pytest.raises(BadDataError) as refused:
+        read_factory_datasheet(station, Image(UUID, blocks))
+    assert refused.value.message.startswith(f"The datasheet that node {UUID.hex()} brought cannot be signed: {message}")
+    assert refused.value.hint == "Write your own: provision --profile P."
+
+
+def test_texts_of_several_lines_are_text_and_a_channel_may_lack_a_name(station: Station) -> None:
+    text = teds.compose(4, [("Text", {"LangCode": "en", "Text": "<a>\n\t\r</a>"})])
+    read_factory_datasheet(station, Image(UUID, {**factory(), (1, 4): text}))
+    none = {place: octets for place, octets in factory().items() if place[1] != 12}
+    assert read_factory_datasheet(station, Image(UUID, none)).name == ""
+    with pytest.raises(BadDataError, match=r"has no datasheet of its own: no TransducerChannel TEDS\.$") as refused:
+        read_factory_datasheet(station, Image(UUID, {(0, 1): factory()[0, 1]}))
+    assert refused.value.hint == "To write one: provision --profile P."
+
+
+@pytest.mark.parametrize(
+    ("name", "free"),
+    [
+        ("471", True),
+        ("4711", False),
+        ("0x4711", False),
+        ("4711ABCD", False),
+        ("4712", True),
+        ("0badc", True),
+        ("xyz4711", True),
+    ],
+)
+def test_four_digits_of_another_nodes_uuid_are_its_name(station: Station, name: str, free: bool) -> None:
+    station.nodes.remember(bytes.fromhex("4711abcd5281f7000000"), name="elbow")
+    station.nodes.remember(UUID, name="joint")
+    image = Image(UUID, named(factory(), 0, name))
+    if free:
+        assert read_factory_datasheet(station, image).name == name
+        return
+    with pytest.raises(
+        PolicyError, match=f"calls itself '{name}', but node 4711abcd5281f7000000 already has that name"
+    ):
+        read_factory_datasheet(station, image)
+
+
+def test_a_reason_is_asked_for_by_the_first_error_and_kept_with_all_of_them(station: Station) -> None:
+    brought = FactoryDatasheet(Image(UUID, {}), "x", (), ("one.", "two."), ("warned",))
+    with pytest.raises(NotAdoptedError) as refused:
+        require_a_reason(station, brought, None)
+    assert refused.value.message == "The board's own datasheet is refused: one (and 1 more)."
+    assert refused.value.datasheet is brought
+    require_a_reason(station, brought, "because")
+    (line,) = [line for line in station.audit_log.entries() if line.act == "accept-datasheet"]
+    assert (line.uuid, line.outcome, line.detail) == (
+        UUID,
+        "accepted",
+        {"why": "because", "findings": ["one.", "two."]},
+    )
+    require_a_reason(station, FactoryDatasheet(Image(UUID, {}), "x", (), (), ("warned",)), "because")
+    assert len([line for line in station.audit_log.entries() if line.act == "accept-datasheet"]) == 1
+    assert brought.findings == [
+        {"severity": "error", "message": "one."},
+        {"severity": "error", "message": "two."},
+        {"severity": "warning", "message": "warned"},
+    ]
+    with pytest.raises(NotAdoptedError, match="brought its own datasheet, which is not approved for signing yet"):
+        refuse_adoption(brought)

@@ -31,6 +31,7 @@ from teds_provision.provisioning.verify import (
     possession_check,
     require_authentic,
     session_check,
+    snapshot_trust,
     verify_image,
 )
 from teds_provision.provisioning.verify_node import judge_and_keep
@@ -457,6 +458,20 @@ def test_a_station_that_is_trusted_by_itself_needs_no_ca(station: Station, image
     assert checks["station certificate"] == Check(
         "station certificate", "skipped", "the station itself is trusted; its CA is not known here"
     )
+
+
+def test_a_stations_own_key_needs_its_ca_and_an_entry_alone_pins_no_key(station: Station, image: Image) -> None:
+    known = snapshot_trust(station)
+    (entry,) = known.pins.entries.values()
+    alone = replace(
+        known,
+        pins=replace(known.pins, entries={entry.uuid: replace(entry, fingerprint=None)}),
+        policy=replace(known.policy, cas=(), cas_of_nodes={}, stations=(station.point,)),
+    )
+    checks = {check.name: check for check in verify_image(alone, image)}
+    assert checks["signing station"].result == "passed"
+    assert checks["station certificate"] == Check("station certificate", "failed", "field 104 matches no trusted CA")
+    assert checks["node key"].why.endswith(", not pinned here")
 
 
 def test_which_failure_of_a_datasheet_its_error_names() -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from teds_provision.errors import BadDataError
 from teds_provision.teds import Sheet
 from teds_provision.teds.calibration import fit
+from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.fits import Fit, judge, met, parse_fits, parse_require
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -249,6 +250,21 @@ def test_a_result_in_whole_words(text: str, result: str, why: str) -> None:
     known = replace(sheet.channels[0], timing=replace(sheet.channels[0].timing, period=1e-4))
     found = only(text, replace(sheet, channels=(known,)))
     assert (found.result, found.why) == (result, why)
+
+
+def test_a_limit_that_is_just_a_value_is_neither_above_nor_below_it() -> None:
+    """Float32 writes 0.7 as 0.69999999 and 0.1 as 0.10000000149."""
+    floats = {"units": parse_unit("N").units, "calibration": None, "sample": SampleForm(1, 4)}
+    sheet = angle(**floats, low=0.10000000149011612, high=0.699999988079071)
+    for text, result in (
+        ("high < 0.7 N", "failed"),
+        ("high >= 0.7 N", "passed"),
+        ("low > 0.1 N", "failed"),
+        ("low <= 0.1 N", "passed"),
+        ("high < 0.70001 N", "passed"),
+        ("low > 0.09999 N", "passed"),
+    ):
+        assert only(text, sheet).result == result, text
 
 
 def test_what_is_not_stated_is_skipped_unless_something_else_is_short() -> None:

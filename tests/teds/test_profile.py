@@ -607,6 +607,8 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         (2, 5, None, ""),
         (3, None, "degF", "{node}_valve3"),
     ]
+    own = profile.build(bytes(range(10)), name="mine").blocks
+    assert words_of(own) == words_of(built.blocks) | {(0, 12): "Format user defined; TCName mine"}
     assert profile.channels[0].calibration == CalibrationDemand()
     assert profile.channels[2].calibration == CalibrationDemand(
         required=True,
@@ -659,6 +661,10 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         ("[[text]]\nkind = 'title'\n", "text[0].xml: the text is missing."),
         (
             "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'deu'\n",
+            "text[0].language: a language has two letters, like",
+        ),
+        (
+            "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'd'\n",
             "text[0].language: a language has two letters, like",
         ),
         ("[[text]]\nkind = 'title'\nxml = 'x'\nchannel = 2\n", "text[0].channel: the type has no channel 2."),

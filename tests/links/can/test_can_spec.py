@@ -66,3 +66,82 @@ def test_any_text_is_read_or_refused_as_usage(text: str) -> None:
         return
     assert 0xF1 <= spec.source <= 0xF7
     assert spec.node is None or 1 <= spec.node <= 239
+
+
+def test_a_bus_has_the_defaults_of_the_profile() -> None:
+    spec = parse_spec("socketcan:can0")
+    assert (spec.bitrate, spec.data_bitrate, spec.node, spec.source, spec.source_named) == (
+        500_000,
+        2_000_000,
+        None,
+        0xF1,
+        False,
+    )
+    assert (spec.fd, spec.pace, spec.options, spec.text, spec.wire) == (
+        False,
+        False,
+        (),
+        "socketcan:can0",
+        "socketcan:can0",
+    )
+
+
+def test_a_named_source_is_the_only_one_and_else_it_is_the_first_choice() -> None:
+    assert parse_spec("socketcan:can0").sources == (0xF1, 0xF2, 0xF3, 0xF4, 0xF5, 0xF6, 0xF7)
+    assert parse_spec("socketcan:can0?source=0xF7").sources == (0xF7,)
+    assert parse_spec("socketcan:can0?source=0xF1").sources == (0xF1,)
+    named, default = parse_spec("socketcan:can0?source=0xF1"), parse_spec("socketcan:can0")
+    assert named == default, "which bus it is does not depend on who named the address"
+
+
+def test_a_bus_is_the_same_however_it_is_used() -> None:
+    one = parse_spec("udp_multicast:239.74.163.2?port=4000&fd=1&bitrate=125000&hop_limit=1&pace=1")
+    assert one.wire == "udp_multicast:239.74.163.2?port=4000"
+    assert parse_spec("udp_multicast:239.74.163.2?b=1&a=x%26y").wire == "udp_multicast:239.74.163.2?a=x&y&b=1"
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("node=240", "--can node='240' is not a whole number from 0x01 to 0xEF."),
+        ("node=1.5", "--can node='1.5' is not a whole number from 0x01 to 0xEF."),
+        ("source=0xF8", "--can source='0xF8' is not a whole number from 0xF1 to 0xF7."),
+        ("bitrate=1000001", "--can bitrate='1000001' is not a whole number from 1 to 1000000."),
+        ("data_bitrate=20000001", "--can data_bitrate='20000001' is not a whole number from 1 to 20000000."),
+        ("fd=2", "--can fd='2' is neither 1 nor 0."),
+        ("interface=x", "--can has an option 'interface=x' that is not of the form key=value."),
+        ("can_filters=x", "--can has an option 'can_filters=x' that is not of the form key=value."),
+        ("a=1&a=1", "--can names a twice."),
+    ],
+)
+def test_a_wrong_option_is_named_in_whole_words(query: str, message: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        parse_spec(f"socketcan:can0?{query}")
+    assert refused.value.message == message
+
+
+@pytest.mark.parametrize(
+    ("query", "value"),
+    [
+        ("a=010", 10),
+        ("a=0x10", 16),
+        ("a=-1", -1),
+        ("a=1e3", 1000.0),
+        ("a=٣", "٣"),
+        ("a=x", "x"),
+        ("a=%2B", "+"),
+        ("a=", ""),
+    ],
+)
+def test_a_value_that_looks_like_a_number_is_one(query: str, value: object) -> None:
+    ((_, found),) = parse_spec(f"socketcan:can0?{query}").options
+    assert (type(found), found) == (type(value), value)
+    assert parse_spec("socketcan:can0?fd=ON&pace=No").fd
+    assert parse_spec("socketcan:can0?bitrate=1000000&data_bitrate=20000000").bitrate == 1_000_000
+
+
+def test_a_key_that_the_interface_does_not_have_is_refused_with_those_that_it_has() -> None:
+    parse_spec("udp_multicast:239.74.163.2?port=4000&node=1&fd=1").require_known()
+    with pytest.raises(UsageError, match=r"^--can udp_multicast has no key 'prot'\.$") as refused:
+        parse_spec("udp_multicast:239.74.163.2?prot=4000").require_known()
+    assert {"port", "hop_limit", "node", "source", "pace", "fd"} <= set(refused.value.hint[8:-1].split(", "))
