@@ -16,7 +16,7 @@ from uuid import uuid4
 from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
 from teds_provision.plant.apply_pages import now, put_roster, require_roster
 from teds_provision.plant.backlog import PastEvent, backlog
-from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.handover.strict_json import load_exact, time_text
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import MemberRequest, payload
 from teds_provision.protocol.plant.roster import (
@@ -226,6 +226,25 @@ def renewed(station: Station, days: timedelta, *, redate: bool = False) -> Roste
 def is_ahead(held: Roster) -> bool:
     """Return True if other stations do not take this roster yet, by this machine's clock: it is dated in the future."""
     return held.created > now() + MOST_AHEAD
+
+
+def require_wrong_date(station: Station, held: Roster) -> None:
+    """Raise PolicyError if the roster is not dated in the future, or another member's page shows a slow clock here.
+
+    A roster dated by a slow clock would end at once everywhere.
+    """
+    if not is_ahead(held):
+        raise PolicyError(
+            f"Roster {held.version} is dated {time_text(held.created)}, not in the future.", hint="Leave --redate out."
+        )
+    latest = time_text(now() + MOST_AHEAD)
+    for digits, created in station.plant.pages.newest():
+        member = held.member(digits)
+        if member is not None and digits != station.fingerprint and created > latest:
+            raise PolicyError(
+                f"The clock of this machine is behind: the newest page of {member.name} is dated {created}.",
+                hint=f"Set the clock of this machine. If that of {member.name} is wrong, have it set, and sync first.",
+            )
 
 
 def require_member(roster: Roster, name: str) -> Member:

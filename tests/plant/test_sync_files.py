@@ -368,6 +368,20 @@ def test_a_roster_of_an_owners_wrong_clock_is_dated_anew_by_his_word(
     assert not plant.owner.is_ahead(later)
 
 
+def test_a_slow_clock_dates_no_roster(plants: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its end would be over everywhere at once. The page of another member shows which clock is wrong."""
+    south, held = plants.member("south", "base"), plants.north.plant.roster
+    assert held is not None
+    with pytest.raises(PolicyError, match="not in the future"):
+        plant.owner.require_wrong_date(plants.north, held)
+    monkeypatch.setattr(plant.owner, "now", lambda: datetime.now(UTC) - timedelta(days=365))
+    plant.owner.require_wrong_date(plants.north, held)  # nobody else has said anything yet
+    pin(south)
+    plants.round()
+    with pytest.raises(PolicyError, match="is behind: the newest page of south is dated 20"):
+        plant.owner.require_wrong_date(plants.north, held)
+
+
 def test_a_request_to_join_of_a_wrong_clock_is_made_anew_with_the_same_login(
     plants: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -116,8 +116,8 @@ def _emit_change(
 
 def _warn_ahead(app: App, ahead: Roster) -> None:
     app.warn(
-        f"Roster {ahead.version} is dated {local_time(ahead.created.isoformat())}, in the future: other stations do not"
-        " take it. If this machine's clock is right: registry renew --redate"
+        f"Roster {ahead.version} is dated {local_time(ahead.created.isoformat())}, in the future by this machine's"
+        " clock. Set the clock; if it is right, no other station takes this roster: registry renew --redate"
     )
 
 
@@ -336,11 +336,8 @@ def renew(app: App, /, days: int, redate: bool, **how: Any) -> None:
     """Extend the roster."""
     station = app.station()
     held = plant.apply_pages.require_roster(station)
-    if redate and not plant.owner.is_ahead(held):
-        raise PolicyError(
-            f"Roster {held.version} is dated {local_time(held.created.isoformat())}, not in the future.",
-            hint="Leave --redate out.",
-        )
+    if redate:
+        plant.owner.require_wrong_date(station, held)
     _emit_change(app, station, plant.owner.renewed(station, timedelta(days=days), redate=redate), **_named(how))
 
 
