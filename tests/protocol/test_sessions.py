@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import GarbledError, NotAuthenticError
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.session import NodeSession, SessionKeys, StationSession, _decrypt, _seal_padded, open_mac
-from teds_provision.protocol.wire_agreement import key_id
+from teds_provision.protocol.wire_agreement import StationAgreement, key_id
 
-from .desk import NODE, STATION, UUID, Desk
+from .desk import CREDENTIALS, NODE, STATION, UUID, Desk
 
 IDENTIFY = security_command(Function.IDENTIFY)
 OFF_CURVE = b"\x04" + bytes(63) + b"\x01"
@@ -181,3 +181,42 @@ def test_a_sealed_reply_whose_padding_is_wrong_is_not_reported_as_a_wrong_tag() 
     assert len(inner) % 16 == 0
     with pytest.raises(NotAuthenticError, match="padding of a sealed reply is wrong; its tag is right"):
         station.unseal(_seal_padded(node._keys.to_station, 1, inner))
+
+
+def test_a_padding_that_is_none_is_a_wrong_tag_and_uses_up_no_counter() -> None:
+    """RFC 5652 6.3: 1 to 16 octets, each their number."""
+    desk = Desk().agree().open()
+    session = desk.session
+    assert session is not None
+    frame = IDENTIFY.encode()
+    wrong = [frame + bytes(10), frame + bytes(9) + b"\x0a", frame + b"\x0a" * 9 + b"\x0b", frame + b"\x11" * 26]
+    wrong += [frame + b"\xff" * 10, frame + b"\x09" + b"\x0a" * 9 + b"\x20" * 16]
+    for blocks in wrong:
+        assert len(blocks) % 16 == 0
+        assert desk.plain(session.seal_padded(blocks)) == refusal(Reason.BAD_TAG), blocks.hex()
+        session._counter -= 1
+    assert desk.sealed(IDENTIFY).ok, "under the counter that was not used up"
+
+
+def test_a_sealed_command_has_counter_a_block_and_a_tag() -> None:
+    desk = Desk().agree().open()
+    for octets in range(36):
+        sealed = security_command(Function.SEALED, bytes(octets))
+        assert desk.plain(sealed) == refusal(Reason.BAD_FORM), octets
+    assert desk.plain(security_command(Function.SEALED, bytes(36))) == refusal(Reason.BAD_TAG)
+
+
+def test_a_request_waits_for_its_confirm_while_other_sessions_end() -> None:
+    """A Confirm comes by the session of its Request; what ends beside it is nothing to it."""
+    desk = Desk().agree().open()
+    own = desk.session
+    agreement = StationAgreement(CREDENTIALS, UUID)
+    reply = desk.sealed(agreement.request())
+    assert reply.ok
+    agreed = agreement.accept(
+        reply.payload, desk.flash.security_teds(), pinned=fingerprint(NODE.point), epoch=desk.flash.epoch
+    )
+    desk.open(link="can:f1")
+    assert desk.sealed(security_command(Function.CLOSE), link="can:f1").ok
+    desk.session = own
+    assert desk.sealed(agreed.confirm).ok
