@@ -306,6 +306,14 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
         return False
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder for results; raises StoreError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"Cannot create folder {folder}: {error.strerror}.") from error
+
+
 def holds(path: Path, octets: bytes) -> bool:
     """Return True if a regular file holds exactly these octets; reads no more of it than their length.
 

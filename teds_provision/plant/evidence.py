@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision import __version__
-from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError, StoreError, UsageError
-from teds_provision.files import SHARED, holds, write_new
+from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError, UsageError
+from teds_provision.files import SHARED, holds, make_folder, write_new
 from teds_provision.protocol.keys import Credentials, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
@@ -124,11 +124,3 @@ def _new_file(folder: Path, name: str, number: int, taken: set[int], document: b
         except UsageError:
             continue
         return path
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for results; raises StoreError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"Cannot create folder {folder}: {error.strerror}.") from error

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, TedsProvisionError
-from teds_provision.files import read_limited
+from teds_provision.files import make_folder, read_limited
 from teds_provision.plant.apply_pages import heads_digest
-from teds_provision.plant.evidence import TOOL, make_folder, sign_evidence
+from teds_provision.plant.evidence import TOOL, sign_evidence
 from teds_provision.plant.jobs import digest_of_file, profile_file, require_adopted, require_open
 from teds_provision.plant.sign_requests import Office, SignatureOrder, by_office
 from teds_provision.protocol.datasheet import SignedNodeKey

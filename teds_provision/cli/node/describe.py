@@ -14,7 +14,8 @@ from teds_provision import measure
 from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.named_files import write_file
 from teds_provision.cli.options import command
-from teds_provision.errors import NotFoundError
+from teds_provision.errors import UsageError
+from teds_provision.files import make_folder
 
 FORMS: Final = ("td", "ros2-control", "aas")
 
@@ -40,7 +41,7 @@ FORMS: Final = ("td", "ros2-control", "aas")
     default=Path(),
     show_default="the working folder",
     metavar="FOLDER",
-    help="Folder for the files.",
+    help="Folder for the files; it is created.",
 )
 @pass_app
 def describe(app: App, uuids: tuple[str, ...], forms: tuple[str, ...], output: Path) -> None:
@@ -50,13 +51,14 @@ def describe(app: App, uuids: tuple[str, ...], forms: tuple[str, ...], output: P
     and the error names the field and the profile key that provides it.
     """
     station = app.station()
-    if not output.is_dir():
-        raise NotFoundError(f"There is no folder {output}.", hint=f"Create it: mkdir {output}")
+    if str(output) == "-":
+        raise UsageError("Files are written, each with its name, so - is no place for them.", hint="Name a folder.")
     made: dict[Path, str] = {}
     for text in uuids:
         node = formats.described_node.described_node(station, station.nodes.resolve(text))
         for form in forms:
             made |= {output / name: content for name, content in _MAKERS[form](station, node).items()}
+    make_folder(output)
     for path, content in made.items():
         write_file(path, content)
     app.emit({"files": [str(path) for path in made]}, "\n".join(str(path) for path in made))
