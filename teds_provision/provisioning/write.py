@@ -316,10 +316,11 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
         raise NotFoundError(
             f"Nothing has been built for node {uuid.hex()}.", hint="build and sign it first, or give --image."
         )
-    name = own_name(station, wanted, profile)
+    record = station.nodes.get(uuid)
+    before = record.profile if profile is None and record is not None else profile
+    name = own_name(station, wanted, before)
     if name is not None:
         facts["name"] = name
-    record = station.nodes.get(uuid)
     if name is not None and draft is not None and file is None and (record is None or record.name != name):
         require_free_name(station, uuid, name)
     if wanted.uuid != uuid:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import GarbledError, NodeRefusedError
-from teds_provision.protocol.messages.frames import Reason, Reply, refusal
+from teds_provision.errors import BadDataError, GarbledError, NodeRefusedError
+from teds_provision.protocol.messages.frames import Command, Reason, Reply, refusal
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.provisioning import teds_read
+from teds_provision.provisioning.conversation import refused
 from teds_provision.provisioning.teds_read import LARGEST_SECURITY, read_block
 from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.image import SECURITY
+from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, MemoryLink, talk
 
 REFUSED = refusal(Reason.NO_SUCH_TEDS).encode()
@@ -76,3 +79,96 @@ def test_an_unexpected_offset_is_asked_again_outside_a_session(board: Board) -> 
     with pytest.raises(GarbledError, match="different offset"):
         read_block(talk(board, steady), SECURITY)
     assert steady.count == 3
+
+
+class Lister:
+    """Mock of a conversation with a node in its session: hands out TEDS as it is told, and notes what it is asked."""
+
+    def __init__(self, answers: dict[tuple[int, int], bytes | NodeRefusedError]) -> None:
+        self.uuid, self.sealed = bytes(10), True
+        self.asked: list[str] = []
+        self.answers = answers
+        self.proven: Identity | None = None
+        self.identity_reply = Identity(bytes(10), NodeState.KEYED, 1, 0, 1024, 0).encode()
+
+    def request_idempotent(self, command: Command, what: str) -> bytes:
+        self.asked.append(what)
+        if what == "to list its TEDS":
+            return b"".join(channel.to_bytes(2, "big") + bytes([code]) for channel, code in self.answers)
+        if what == "to identify itself":
+            return self.identity_reply
+        channel, code = command.channel, command.payload[0]
+        answer = self.answers[channel, code]
+        if isinstance(answer, NodeRefusedError):
+            raise answer
+        offset = int.from_bytes(command.payload[1:5], "big")
+        return offset.to_bytes(4, "big") + answer[offset : offset + 1000]
+
+
+NAME, LONG = frame(bytes.fromhex("0304000c0101040100050161")), frame(bytes(2500))
+
+
+def test_every_listed_teds_is_read_but_one_that_is_gone_meanwhile() -> None:
+    node = Lister({(0, 1): LONG, (0, 12): NAME, (1, 3): refused(18, "x", sealed=True)})
+    found = teds_read.read_image(node)  # type: ignore[arg-type]
+    assert found.blocks == {(0, 1): LONG, (0, 12): NAME}
+    assert node.asked.count("to read TEDS 1 of channel 0") == 3
+    known = teds_read.read_image(node, listed=[(0, 12), (0, 128)], initial=b"known")  # type: ignore[arg-type]
+    assert known.blocks == {(0, 12): NAME, (0, 128): b"known"}
+    assert node.asked.count("to list its TEDS") == 1
+    node.answers[1, 3] = refused(2, "x", sealed=True)
+    with pytest.raises(NodeRefusedError):
+        teds_read.read_image(node)  # type: ignore[arg-type]
+
+
+def test_an_image_has_four_mebibytes_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = iter([4 << 20, 0, (4 << 20) - 3, 3, 1])
+    monkeypatch.setattr(teds_read, "read_block", lambda *_args, **_more: bytes(next(sizes)))
+    node = Lister({})
+    teds_read.read_image(node, listed=[(0, 1), (0, 2)])  # type: ignore[arg-type]
+    with pytest.raises(BadDataError, match=r"^The node lists more than 4 MiB of TEDS\.$"):
+        teds_read.read_image(node, listed=[(0, 1), (0, 2), (0, 3)])  # type: ignore[arg-type]
+
+
+def test_an_identify_of_another_node_is_noise_and_one_in_a_session_is_kept() -> None:
+    node = Lister({})
+    own = teds_read.read_identity(node)  # type: ignore[arg-type]
+    assert node.proven == own
+    node.sealed, node.proven = False, None
+    teds_read.read_identity(node)  # type: ignore[arg-type]
+    assert node.proven is None
+    node.identity_reply = Identity(bytes(9) + b"\1", NodeState.KEYED, 1, 0, 1024, 0).encode()
+    with pytest.raises(GarbledError, match=f"gave its UUID as {'00' * 10} before and gives {'00' * 9}01 now"):
+        teds_read.read_identity(node)  # type: ignore[arg-type]
+
+
+def test_a_node_is_asked_once_which_of_its_teds_is_fixed() -> None:
+    asked: list[tuple[int, int]] = []
+
+    def ask(block: tuple[int, int]) -> bool:
+        asked.append(block)
+        return block[1] == 130
+
+    blocks = {(0, 12): b"a", (0, 130): b"b", (0, 128): b"c"}
+    found = teds_read.NodeSnapshot(Image(bytes(10), blocks), Identity(bytes(10), NodeState.KEYED, 1, 0, 1024, 0), ask)
+    assert not found.is_read_only((0, 128)), "the Security TEDS never is"
+    assert not found.is_read_only((5, 5))
+    assert asked == []
+    assert found.fixed_beside({(0, 12)}) == {(0, 130): b"b"}
+    assert asked == [(0, 130)]
+    assert found.fixed_beside({(0, 130)}) == {}
+    assert found.fixed_beside({}) == {(0, 130): b"b"}
+    assert not found.is_fixed
+    assert sorted(asked) == [(0, 12), (0, 130)]
+    alone = Image(bytes(10), {(0, 130): b"b", (0, 128): b"c"})
+    assert teds_read.NodeSnapshot(alone, found.identity, ask).is_fixed
+
+
+@pytest.mark.parametrize(("state", "security"), [(NodeState.KEYED, b"known"), (NodeState.PROVISIONED, NAME)])
+def test_the_security_teds_of_a_node_that_was_written_is_read_in_its_session(state: NodeState, security: bytes) -> None:
+    node = Lister({(0, 128): NAME})
+    node.identity_reply = Identity(bytes(10), state, 1, 0, 1024, 0).encode()
+    assert teds_read.take_snapshot(node, initial=b"known").image.security == security  # type: ignore[arg-type]
+    assert node.asked[0] == "to identify itself"
+    teds_read.take_snapshot(node)  # type: ignore[arg-type]
+    assert node.asked.count("to identify itself") == 1, "it has proved it in this session"

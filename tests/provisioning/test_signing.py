@@ -1,0 +1,242 @@
+"""When a datasheet is signed again, under which number, and what a signature leaves in the store."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from teds_provision import teds
+from teds_provision.errors import BadDataError, FrozenError, NotFoundError, PolicyError
+from teds_provision.protocol.datasheet import SignedNodeKey
+from teds_provision.provisioning.sign import (
+    SignOrder,
+    known_node_keys,
+    node_keys_of,
+    require_not_measured,
+    sign,
+    sign_image,
+    unsigned_security,
+)
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import Draft
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.image import SECURITY, Image
+from tests.bench import Board, make_station
+
+from .test_provision import run
+
+
+@pytest.fixture
+def image(station: Station, board: Board) -> Image:
+    return run(station, board).image
+
+
+@pytest.fixture
+def keys(station: Station, image: Image) -> SignedNodeKey:
+    return known_node_keys(station, image.uuid, image)
+
+
+def renamed(image: Image, name: str = "other") -> Image:
+    return image.with_block((0, 12), teds.compose(12, {"Format": 0, "TCName": name}))
+
+
+def security_of(image: Image) -> bytes:
+    octets = image.security
+    assert octets is not None
+    return octets
+
+
+def test_what_is_signed_already_is_not_signed_again(station: Station, image: Image, keys: SignedNodeKey) -> None:
+    def again(made: Image = image, *, epoch: int = 1, node: int = 1, **more: object) -> tuple[int, bool]:
+        done = sign(station, keys, made, epoch=epoch, node_sequence=node, **more)  # type: ignore[arg-type]
+        return done.sequence, done.reused
+
+    octets = security_of(image)
+    assert again(on_node=octets) == (1, True), "the very one that the node has"
+    assert again(earlier=[octets], node=0) == (1, True), "one that never arrived, above the node's"
+    assert again(on_node=b"no TEDS", earlier=[octets], node=0) == (1, True)
+    before = station.nodes.get(image.uuid)
+    assert before is not None
+    assert before.sequence == 1
+    assert again(earlier=[octets]) == (2, False), "the node would refuse it"
+    assert again(on_node=octets, epoch=2) == (3, False)
+    assert again(renamed(image), on_node=octets) == (4, False)
+    assert again(on_node=octets, sequence=9) == (9, False), "a number that was asked for"
+    assert again(on_node=security_of(image)[:-3] + b"\0\0\0") == (10, False)
+    assert again(node=70_000) == (70_001, False), "the node may have one by another station"
+    known = station.nodes.get(image.uuid)
+    assert known is not None
+    assert known.sequence == 70_001
+
+
+def test_another_signer_signs_again(station: Station, image: Image, keys: SignedNodeKey) -> None:
+    shown = security.decode(security_of(image))
+    for change in (
+        {"station_key": station.ca},
+        {"ca": "other"},
+        {"node_key_signature": bytes(64)},
+        {"signature": bytes(64)},
+        {"signature": None},
+    ):
+        octets = replace(shown, **change).encode()  # type: ignore[arg-type]
+        assert not sign(station, keys, image, epoch=1, node_sequence=1, on_node=octets).reused, change
+
+
+def test_under_another_name_of_the_station_a_datasheet_is_signed_again(
+    station: Station, image: Image, keys: SignedNodeKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(type(station), "name", property(lambda _station: "renamed"))
+    assert not sign(station, keys, image, epoch=1, node_sequence=1, on_node=security_of(image)).reused
+
+
+def test_a_signature_holds_what_it_was_made_for_and_is_in_the_log(
+    station: Station, image: Image, keys: SignedNodeKey
+) -> None:
+    done = sign(
+        station, keys, renamed(image), epoch=3, node_sequence=7, keep_draft=True, profile="gripper", unit=("J1", 4)
+    )
+    shown = security.decode(security_of(done.image))
+    assert (shown.sequence, shown.key_epoch, shown.station_key) == (8, 3, station.point)
+    assert (shown.node_key, shown.node_key_signature) == (keys.key, keys.signature)
+    assert set(shown.signed_blocks) == set(image.unsigned_blocks())
+    assert done.signature == shown.signature
+    draft = station.datasheets.draft(image.uuid)
+    assert draft is not None
+    assert (draft.stage, draft.profile, draft.image) == ("signed", "gripper", done.image)
+    line = [entry for entry in station.audit_log.entries() if entry.act == "sign"][-1]
+    assert (line.uuid, line.outcome) == (image.uuid, "done")
+    assert line.detail == {"sequence": 8, "epoch": 3, "teds": renamed(image).digest()}
+
+
+def test_what_stops_a_signature_leaves_the_number_free(station: Station, image: Image, keys: SignedNodeKey) -> None:
+    def stop() -> None:
+        raise FrozenError("it is being measured")
+
+    with pytest.raises(FrozenError):
+        sign(station, keys, renamed(image), epoch=1, node_sequence=1, before=stop)
+    assert sign(station, keys, image, epoch=1, node_sequence=1, on_node=security_of(image), before=stop).reused
+    with pytest.raises(PolicyError, match="no sequence numbers left"):
+        sign(station, keys, renamed(image), epoch=1, node_sequence=0xFFFFFFFF)
+    known = station.nodes.get(image.uuid)
+    assert known is not None
+    assert known.sequence == 1
+    assert sign(station, keys, renamed(image), epoch=1, node_sequence=0xFFFFFFFE).sequence == 0xFFFFFFFF
+    damaged = image.with_block((0, 12), image.blocks[0, 12][:-1] + b"\0")
+    with pytest.raises(BadDataError, match=r"^TEDS 12 of channel 0 is damaged: Length, checksum or class is wrong\.$"):
+        sign(station, keys, damaged, epoch=1, node_sequence=1)
+    misplaced = image.with_block((0, 3), frame(bytes.fromhex("0304000c0101")))
+    with pytest.raises(BadDataError, match="TEDS 3 of channel 0 is damaged"):
+        sign(station, keys, misplaced, epoch=1, node_sequence=1)
+
+
+def test_whose_keys_are_signed(station: Station, image: Image, board: Board) -> None:
+    assert node_keys_of(image.uuid, security_of(image)).key == board.key.point
+    other = bytes(9) + b"\1"
+    with pytest.raises(
+        BadDataError, match=rf"^The Security TEDS of {other.hex()} belongs to another node \(field 102\)"
+    ):
+        node_keys_of(other, security_of(image))
+    with pytest.raises(NotFoundError, match=f"The key of node {other.hex()} is not known yet"):
+        known_node_keys(station, other)
+    bare = Image(image.uuid, image.unsigned_blocks())
+    assert known_node_keys(station, image.uuid, bare).key == board.key.point, "of the last reading"
+
+
+def test_a_security_teds_before_its_signature_has_the_present_numbers(
+    station: Station, image: Image, keys: SignedNodeKey
+) -> None:
+    station.nodes.remember(image.uuid, sequence=12, epoch=5)
+    shown = security.decode(unsigned_security(station, keys, image))
+    assert (shown.signed, shown.sequence, shown.key_epoch) == (False, 12, 5)
+    assert shown.station_key == station.point
+    unknown = SignedNodeKey(bytes(9) + b"\1", keys.key, keys.signature)
+    shown = security.decode(unsigned_security(station, unknown, image))
+    assert (shown.sequence, shown.key_epoch) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("released", "tapped", "holder", "frozen"),
+    [
+        (False, False, "ncap", True),
+        (True, False, "ncap", False),
+        (False, True, "ncap", False),
+        (False, False, None, False),
+    ],
+)
+def test_a_node_that_is_measured_is_left_alone(
+    station: Station, monkeypatch: pytest.MonkeyPatch, released: bool, tapped: bool, holder: str | None, frozen: bool
+) -> None:
+    monkeypatch.setattr(station.measurements, "holder", lambda _uuid: holder)
+    node = SimpleNamespace(uuid=bytes(10), tapped=tapped)
+    if not frozen:
+        require_not_measured(station, node, released=released)  # type: ignore[arg-type]
+        return
+    with pytest.raises(FrozenError) as refused:
+        require_not_measured(station, node, released=released, undone="Nothing was done.")  # type: ignore[arg-type]
+    assert refused.value.message == f"Node {'00' * 10} is being measured by ncap. Nothing was done."
+
+
+def brought(image: Image, *, sequence: int, epoch: int = 1, unsigned: bool = True) -> Image:
+    """Return an image file from elsewhere: what the node has, under another name and number."""
+    shown = security.decode(security_of(image))
+    made = replace(shown, sequence=sequence, key_epoch=epoch)
+    return renamed(image, "brought").with_block(
+        SECURITY, (replace(made, signature=None) if unsigned else made).encode()
+    )
+
+
+@pytest.mark.parametrize(
+    ("sequence", "epoch", "signed_as"), [(0, 1, (2, 1)), (5, 1, (6, 1)), (5, 3, (6, 3)), (65537, 1, (65538, 1))]
+)
+def test_an_image_file_counts_where_it_is_newer(
+    station: Station, image: Image, sequence: int, epoch: int, signed_as: tuple[int, int]
+) -> None:
+    done = sign_image(station, SignOrder(image.uuid, brought(image, sequence=sequence, epoch=epoch)), None).signed
+    shown = security.decode(security_of(done.image))
+    assert (shown.sequence, shown.key_epoch) == signed_as
+
+
+def test_an_image_file_uses_up_no_numbers_of_a_known_node(station: Station, image: Image) -> None:
+    far = brought(image, sequence=65538)
+    with pytest.raises(PolicyError, match="The image has sequence 65538; the last one known here is 1") as refused:
+        sign_image(station, SignOrder(image.uuid, far), None)
+    assert refused.value.hint == "That number is unverified. Check it against the node: sign IMAGE --read-node"
+    ours = brought(image, sequence=900, unsigned=False)
+    assert sign_image(station, SignOrder(image.uuid, ours), None).signed.sequence == 2, "a number that was given here"
+
+
+def test_what_is_kept_of_what_was_signed(station: Station, image: Image) -> None:
+    again = sign_image(station, SignOrder(image.uuid), None)
+    assert (again.signed.reused, again.changes, station.datasheets.draft(image.uuid)) == (True, (), None)
+    file = sign_image(station, SignOrder(image.uuid, brought(image, sequence=5)), None)
+    assert station.datasheets.draft(image.uuid) is None, "an image that was not built here stays the caller's"
+    assert len(file.changes) == 1
+    built = renamed(image, "built")
+    station.datasheets.keep_draft(Draft(image.uuid, built, "built", "gripper"))
+    plan = sign_image(station, SignOrder(image.uuid, dry_run=True), None)
+    assert not plan.signed.reused
+    draft = station.datasheets.draft(image.uuid)
+    assert draft is not None
+    assert draft.stage == "built"
+    done = sign_image(station, SignOrder(image.uuid), None)
+    draft = station.datasheets.draft(image.uuid)
+    assert draft is not None
+    assert (draft.stage, draft.profile, draft.image) == ("signed", "gripper", done.signed.image)
+    assert sign_image(station, SignOrder(image.uuid), None).signed == replace(done.signed, reused=True)
+
+
+def test_nothing_is_signed_of_a_node_without_a_datasheet(station: Station, image: Image, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    from teds_provision.station.store.records import WhitelistEntry
+
+    uuid = bytes(9) + b"\1"
+    station.pins.put(WhitelistEntry(uuid))
+    with pytest.raises(NotFoundError, match=rf"^Nothing has been built for node {uuid.hex()}\.$"):
+        sign_image(station, SignOrder(uuid), None)
+    with pytest.raises(NotFoundError):
+        sign_image(station, SignOrder(uuid, Image(uuid, {SECURITY: security_of(image)})), None)
+    other = make_station(tmp_path / "other")
+    with pytest.raises(PolicyError):
+        sign_image(other, SignOrder(image.uuid, image), None)

@@ -1,0 +1,210 @@
+"""What is staged, in which order and pieces, what is too old or too far ahead, and what the store keeps of a write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision import teds
+from teds_provision.errors import BadDataError, NodeSilentError, NotFoundError, PolicyError
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.provisioning import write as writing
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.sign import SignOrder, sign_image
+from teds_provision.provisioning.write import write
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import Draft
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, Image
+from tests.bench import Board, talk
+
+from .test_provision import run
+
+
+@pytest.fixture
+def image(station: Station, board: Board) -> Image:
+    return run(station, board).image
+
+
+def renamed(image: Image, name: str) -> Image:
+    return image.with_block((0, 12), teds.compose(12, {"Format": 0, "TCName": name}))
+
+
+@pytest.mark.parametrize(
+    ("sequence", "epoch", "jump", "message"),
+    [
+        (10, 2, False, "The image has sequence 10; the node is already at 10."),
+        (9, 3, False, "The image has sequence 9; the node is already at 10."),
+        (11, 2, False, ""),
+        (11, 1, False, "The image was signed for key epoch 1; the node is at 2."),
+        (11, 3, True, "The image was signed for key epoch 3; the node is at 2."),
+        (10 + 65536, 2, False, ""),
+        (
+            11 + 65536,
+            2,
+            False,
+            "The image has sequence 65547, far ahead of the node's 10: earlier data about this node",
+        ),
+        (11 + 65536, 2, True, ""),
+    ],
+)
+def test_an_image_is_newer_than_the_nodes_and_of_its_epoch(
+    station: Station, sequence: int, epoch: int, jump: bool, message: str
+) -> None:
+    identity = Identity(bytes(10), NodeState.PROVISIONED, 2, 10, 1024, 0)
+    signed: Any = type("Signed", (), {"sequence": sequence, "key_epoch": epoch})
+    if not message:
+        writing._require_newer(station, bytes(10), signed, identity, jump=jump)
+        return
+    with pytest.raises(PolicyError) as refused:
+        writing._require_newer(station, bytes(10), signed, identity, jump=jump)
+    assert refused.value.message.startswith(message)
+    again = f"Sign it again for the node as it is now: teds-provision sign {'00' * 10} --read-node"
+    assert refused.value.hint.startswith(again)
+    assert ("--sequence-jump" in refused.value.hint) == ("far ahead" in message)
+
+
+@dataclass
+class MockNode:
+    """Mock of a conversation in a session: takes writes, loses those that ``lost`` counts."""
+
+    max_message: int = 153
+    lost: list[bool] = field(default_factory=list)
+    alive: bool = True
+    written: list[tuple[str, int]] = field(default_factory=list)
+
+    @property
+    def identity(self) -> Any:
+        return self
+
+    def is_alive(self) -> bool:
+        return self.alive
+
+    def request(self, command: Any, what: str) -> bytes:
+        if self.lost and self.lost.pop(0):
+            raise NodeSilentError("lost")
+        self.written.append((what, len(command.payload) - 5))
+        return b""
+
+
+BLOCKS = {(0, 1): bytes(100), (0, 12): bytes(101), SECURITY: bytes(30), (1, 3): bytes(7)}
+
+
+def stage(station: Station, node: MockNode, skip: set[tuple[int, int]], progress: Any = None) -> int:
+    return writing._stage(station, node, Image(bytes(10), BLOCKS), skip, progress)  # type: ignore[arg-type]
+
+
+def test_teds_go_in_pieces_of_what_the_node_takes_and_the_security_teds_last(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, seen = MockNode(), []
+    flushed: list[int] = []
+    monkeypatch.setattr(station, "flush", lambda: flushed.append(len(node.written)))
+    assert stage(station, node, {(0, 7)}, lambda done, total: seen.append((done, total))) == 238
+    assert node.written == [
+        ("TEDS 1 of channel 0", 100),
+        ("TEDS 12 of channel 0", 100),
+        ("TEDS 12 of channel 0", 1),
+        ("TEDS 3 of channel 1", 7),
+        ("TEDS 128 of channel 0", 30),
+    ]
+    assert seen == [(100, 238), (200, 238), (201, 238), (208, 238), (238, 238)]
+    assert flushed == [4], "the sequence is on the disk before the signature leaves"
+    node.written.clear()
+    assert stage(station, node, {(0, 1), (1, 3)}) == 131
+    assert [what for what, _ in node.written] == ["TEDS 12 of channel 0"] * 2 + ["TEDS 128 of channel 0"]
+
+
+def test_pieces_shrink_with_each_loss_to_48_octets_and_twenty_losses_are_borne(station: Station) -> None:
+    node = MockNode(lost=[True, False, True, True] + [False] * 20)
+    assert stage(station, node, set(BLOCKS) - {(0, 1)}) == 100
+    assert [octets for _, octets in node.written] == [50, 48, 2]
+    node = MockNode(lost=[True] * 20)
+    assert stage(station, node, set(BLOCKS) - {(1, 3)}) == 7
+    with pytest.raises(NodeSilentError):
+        stage(station, MockNode(lost=[True] * 21), set(BLOCKS) - {(1, 3)})
+    dead = MockNode(lost=[True], alive=False)
+    with pytest.raises(NodeSilentError):
+        stage(station, dead, set())
+
+
+def test_what_is_on_the_node_after_a_commit_is_known_unless_there_was_more() -> None:
+    image = Image(bytes(10), BLOCKS)
+    assert writing._after_commit(image, None) is None
+    assert writing._after_commit(image, Image(bytes(10), {(0, 1): b"old"})) is image
+    assert writing._after_commit(image, Image(bytes(10), {(9, 9): b"more"})) is None
+
+
+def test_equal_teds_are_not_sent_again_but_the_security_teds_is(station: Station, image: Image) -> None:
+    all_but = set(image.unsigned_blocks())
+    assert writing._blocks_there(station, image, image) == all_but
+    assert writing._blocks_there(station, image, None) == all_but, "by the last reading"
+    assert writing._blocks_there(station, renamed(image, "x"), image) == all_but - {(0, 12)}
+    assert writing._blocks_there(station, Image(bytes(9) + b"\1", image.blocks), None) == set()
+
+
+def test_a_write_is_in_the_store_with_its_facts_and_ends_its_own_draft_alone(
+    station: Station, board: Board, image: Image
+) -> None:
+    station.datasheets.keep_draft(Draft(image.uuid, renamed(image, "new"), "built", "gripper"))
+    signed = sign_image(station, SignOrder(image.uuid), None).signed.image
+    with talk(board) as node:
+        require_session(station, node)
+        done = write(station, node, signed, facts={"name": "new"})
+        station.flush()
+        assert node.proven is not None
+        assert (node.proven.sequence, node.proven.state) == (2, NodeState.PROVISIONED)
+    assert done.on_node == signed
+    assert done.octets == len(signed.blocks[0, 12]) + len(signed.blocks[SECURITY])
+    known = station.nodes.get(image.uuid)
+    assert known is not None
+    assert known.name == "new"
+    assert station.datasheets.draft(image.uuid) is None
+    line = [entry for entry in station.audit_log.entries() if entry.act == "write"][-1]
+    assert (line.uuid, line.outcome, line.detail) == (image.uuid, "done", {"octets": done.octets, "sequence": 2})
+    newer = Draft(image.uuid, renamed(image, "newer"), "built", None)
+    station.datasheets.keep_draft(newer)
+    third = sign_image(station, SignOrder(image.uuid, renamed(signed, "third")), None).signed.image
+    with talk(board) as node:
+        require_session(station, node)
+        assert write(station, node, third).octets > 0
+    station.flush()
+    kept = station.datasheets.draft(image.uuid)
+    assert kept is not None
+    assert kept.image == newer.image
+    with talk(board) as node:
+        require_session(station, node)
+        assert write(station, node, third).octets == 0, "all of it is there"
+        with pytest.raises(BadDataError, match="The image is not signed"):
+            write(
+                station,
+                node,
+                third.with_block(SECURITY, replace(security.decode(third.blocks[SECURITY]), signature=None).encode()),
+            )
+
+
+def test_which_image_is_written(station: Station, image: Image, tmp_path: Path) -> None:
+    uuid, other = image.uuid, bytes(9) + b"\1"
+    assert writing._wanted(station, uuid, None) == (image, {}), "the name of all of its type became its own"
+    file = tmp_path / "image.json"
+    file.write_text(renamed(image, "filed").to_json())
+    assert writing._wanted(station, uuid, file) == (renamed(image, "filed"), {"name": "filed"})
+    draft = renamed(image, "drafted")
+    station.datasheets.keep_draft(Draft(uuid, draft, "signed", "gripper"))
+    assert writing._wanted(station, uuid, None) == (draft, {"profile": "gripper", "name": "drafted"})
+    assert writing._wanted(station, uuid, file)[1] == {"name": "filed"}, "the draft's type is not the file's"
+    station.nodes.remember(other, name="drafted")
+    with pytest.raises(PolicyError, match=f"Node {other.hex()} already has the name 'drafted'"):
+        writing._wanted(station, uuid, None)
+    station.nodes.remember(uuid, name="drafted")
+    assert writing._wanted(station, uuid, None)[0] == draft, "a name that the node has already is no news"
+    with pytest.raises(NotFoundError, match=f"Nothing has been built for node {other.hex()}"):
+        writing._wanted(station, other, None)
+    with pytest.raises(PolicyError, match=f"The image is for node {uuid.hex()}, not for {other.hex()}"):
+        writing._wanted(station, other, file)
+    file.write_text(Image(uuid, image.unsigned_blocks()).to_json())
+    with pytest.raises(BadDataError, match=r"^The image has no Security TEDS\.$"):
+        writing._wanted(station, uuid, file)
