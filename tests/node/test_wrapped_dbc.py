@@ -215,10 +215,24 @@ def test_a_frame_that_cannot_be_decoded_is_counted_and_changes_nothing() -> None
     messages: list[str] = []
     supply = reader("Supply", messages)
     supply.handle(SensorFrame(292, False, bytes.fromhex("05"), 1.0))
-    supply.handle(SensorFrame(292, False, bytes.fromhex("0500000000000000"), 1.0))
+    supply.handle(SensorFrame(292, False, bytes.fromhex("00c05d"), 1.0))
     assert (supply.frames, supply.bad, len(messages)) == (0, 2, 1)
     assert "Supply cannot be decoded" in messages[0]
     assert all(part.last is None for part in supply.values)
+
+
+def test_a_frame_with_a_multiplexer_value_that_the_file_does_not_name_has_the_other_signals() -> None:
+    """Files often name only some turns: the signals that every frame carries were invalid in all other turns."""
+    messages: list[str] = []
+    supply = reader("Supply", messages)
+    by_name = {part.channel.name: part for part in supply.values}
+    supply.handle(SensorFrame(292, False, bytes.fromhex("00c05d0000000000"), 1.0))
+    supply.handle(SensorFrame(292, False, bytes.fromhex("0500000000000000"), 1.05))
+    assert (supply.frames, supply.bad, messages) == (2, 0, [])
+    group, voltage = by_name["group"].at(1.06)[0], by_name["voltage"].at(1.06)[0]
+    assert group is not None
+    assert voltage is not None
+    assert (group.raw, voltage.raw, by_name["current"].last) == (5, 0x5DC0, None)
 
 
 def test_a_channel_reports_when_it_becomes_invalid_and_valid_again() -> None:

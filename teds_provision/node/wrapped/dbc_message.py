@@ -7,7 +7,9 @@ and in :mod:`latest_values`.
 from __future__ import annotations
 
 import hashlib
+from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -79,17 +81,36 @@ class DbcMessage:
             return FrameKey(pgn_of(identifier), extended=True, pgn=True)
         return FrameKey(identifier, self.message.is_extended_frame)
 
+    @cached_property
+    def _plain(self) -> Message:
+        """The message with the signals alone that every frame of it carries."""
+        signals = [copy(signal) for signal in self.message.signals if not signal.multiplexer_ids]
+        for signal in signals:
+            signal.is_multiplexer = False
+        return type(self.message)(
+            self.message.frame_id,
+            self.message.name,
+            self.message.length,
+            signals,
+            is_extended_frame=self.message.is_extended_frame,
+            strict=False,
+        )
+
     def numbers(self, data: bytes) -> dict[str, float]:
         """Return the raw number of each signal in a frame by name; of multiplexed ones those that it carries.
 
-        Raises BadDataError for a frame that is too short, or a multiplexer value that the file does not name.
+        A frame whose multiplexer value the file does not name has the others. Raises BadDataError for one that is too
+        short.
         """
         from cantools.database import DecodeError
 
         try:
             decoded = self.message.decode(data, decode_choices=False, scaling=False)
         except DecodeError as error:
-            raise BadDataError(f"A frame of {self.message.name} cannot be decoded: {error}.") from error
+            try:
+                decoded = self._plain.decode(data, decode_choices=False, scaling=False)
+            except DecodeError:
+                raise BadDataError(f"A frame of {self.message.name} cannot be decoded: {error}.") from error
         if not isinstance(decoded, dict):
             raise BadDataError(f"A frame of {self.message.name} cannot be decoded.")
         return {name: raw for name, raw in decoded.items() if isinstance(raw, int | float)}
