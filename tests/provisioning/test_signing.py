@@ -189,7 +189,8 @@ def brought(image: Image, *, sequence: int, epoch: int = 1, unsigned: bool = Tru
 
 
 @pytest.mark.parametrize(
-    ("sequence", "epoch", "signed_as"), [(0, 1, (2, 1)), (5, 1, (6, 1)), (5, 3, (6, 3)), (65537, 1, (65538, 1))]
+    ("sequence", "epoch", "signed_as"),
+    [(0, 1, (2, 1)), (5, 1, (6, 1)), (5, 3, (6, 3)), (5, 0, (6, 1)), (65537, 1, (65538, 1))],
 )
 def test_an_image_file_counts_where_it_is_newer(
     station: Station, image: Image, sequence: int, epoch: int, signed_as: tuple[int, int]
