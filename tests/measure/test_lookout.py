@@ -14,7 +14,18 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflictError, NodeRefusedError, NoNodeError, PolicyError
+from teds_provision.errors import (
+    AddressConflictError,
+    BadDataError,
+    BadDatasheetError,
+    InternalError,
+    NodeRefusedError,
+    NoNodeError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+    TedsProvisionError,
+)
 from teds_provision.links.can.link import conflict
 from teds_provision.links.discovery import PolledDiscovery, Sighting
 from teds_provision.links.ports import Contact
@@ -22,6 +33,7 @@ from teds_provision.measure import presence, request
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.presence import MOST, TWIN, Presence
 from teds_provision.measure.request import Requirements
+from teds_provision.measure.running import retry_policy
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.retry_policy import RetryPolicy
 from teds_provision.protocol.announce import Announce, uuid_crc
@@ -421,3 +433,130 @@ def test_a_node_that_answers_where_it_is_has_not_moved() -> None:
     sightings.let_announce(ONE)
     sightings.add_sighting(there)
     assert course == ["moved"]
+
+
+NO_KEY, SILENT = PolicyError("It knows none of the keys."), NoNodeError("Silent.")
+
+
+@pytest.mark.parametrize(
+    ("timeout", "ran", "after", "error", "how", "gives_up"),
+    [
+        (10.0, False, 9.9, SILENT, {}, False),
+        (10.0, False, 10.1, SILENT, {}, True),
+        (10.0, False, 0.0, NO_KEY, {"proven": True}, True),
+        (10.0, False, 0.0, NO_KEY, {"elsewhere": True}, False),
+        (10.0, False, 0.0, NO_KEY, {}, True),
+        (10.0, False, 0.0, NO_KEY, {"decided": True, "elsewhere": True}, True),
+        (10.0, False, 0.0, NotAuthenticError("Forged."), {"proven": True}, True),
+        (10.0, False, 0.0, BadDataError("No sensor."), {"proven": True}, True),
+        (10.0, False, 0.0, StoreError("The disk is away."), {"proven": True}, True),
+        (10.0, False, 0.0, InternalError("A bug."), {"proven": True}, True),
+        (10.0, False, 0.0, NodeRefusedError("Busy.", reason=17), {"proven": True}, False),
+        (10.0, False, 10.1, NodeRefusedError("Busy.", reason=17), {"proven": True}, True),
+        (10.0, False, 0.0, NodeRefusedError("No stream.", reason=22), {"proven": True}, False),
+        (10.0, False, 0.0, NodeRefusedError("Too long.", reason=4), {"proven": True}, True),
+        (10.0, True, 99.0, SILENT, {}, False),
+        (10.0, True, 0.0, NO_KEY, {"proven": True}, False),
+        (10.0, True, 0.0, NO_KEY, {"decided": True}, True),
+        (10.0, True, 0.0, BadDatasheetError("Not authentic."), {"proven": True}, True),
+        (10.0, True, 0.0, BadDatasheetError("Not authentic."), {}, False),
+        (None, False, 99.0, SILENT, {}, False),
+        (None, False, 0.0, NO_KEY, {"decided": True}, False),
+        (None, True, 0.0, BadDatasheetError("Not authentic."), {"proven": True}, False),
+    ],
+)
+def test_when_a_node_is_given_up(
+    timeout: float | None,
+    ran: bool,
+    after: float,
+    error: TedsProvisionError,
+    how: dict[str, bool],
+    gives_up: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Until its first value for a time, and at once for what no time cures; the service never gives up."""
+    now = [100.0]
+    monkeypatch.setattr(retry_policy, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    policy = RetryPolicy(timeout)
+    if ran:
+        policy.has_run()
+    now[0] += after
+    found = policy.gives_up(
+        error,
+        proven=how.get("proven", False),
+        decided=how.get("decided", False),
+        elsewhere=lambda: how.get("elsewhere", False),
+    )
+    assert found is gives_up
+
+
+def test_a_node_that_is_tried_again_says_when_and_for_how_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(retry_policy, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    policy = RetryPolicy(10.0)
+    now[0] = 103.0
+    assert (policy.next_try(2.0), policy.next_try(8.0)) == ("2 s, giving up in 7 s", "7 s, giving up in 7 s")
+    now[0] = 111.0
+    assert policy.seconds_left == 0.0
+    policy.has_run()
+    assert (policy.next_try(8.0), policy.seconds_left) == ("8 s", math.inf)
+
+
+def test_the_same_trouble_with_addresses_is_noted_every_ten_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, notes = [1000.0], list[str]()
+    monkeypatch.setattr(presence, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    sightings = Presence(note=notes.append)
+    for at, text in ((0.0, "one"), (1.0, "two"), (599.0, "one"), (600.0, "one"), (600.5, "two"), (601.5, "two")):
+        now[0] = 1000.0 + at
+        sightings.report(text)
+    assert notes == ["one", "two", "one", "two"]
+    for number in range(1100):
+        sightings.report(str(number))
+    assert len(sightings._reported) == 1024, "who makes up addresses fills no memory"
+    assert "one" not in sightings._reported, "the oldest is forgotten"
+
+
+def test_a_node_is_gone_once_however_often_it_is_waited_for_in_vain() -> None:
+    sightings = Presence()
+    for _ in range(3):
+        with pytest.raises(NoNodeError, match=f"Node {ONE.hex()} did not answer within 0 s"):
+            find(sightings, ONE, seconds=0.0)
+    assert sightings.gone == 1
+    sightings.add_sighting(seen(ONE, 7))
+    find(sightings, ONE)
+    assert sightings.gone == 1
+    with pytest.raises(NoNodeError):
+        find(sightings, ONE, seconds=0.0, fresh=time.monotonic() + 5.0)
+    assert sightings.gone == 2
+
+
+def test_who_stops_waiting_for_a_node_is_told_that_it_did_not_answer() -> None:
+    stopped = threading.Event()
+    stopped.set()
+    with pytest.raises(NoNodeError):
+        Presence().find(ONE, seconds=PATIENCE, stop=stopped)
+
+
+def test_nodes_that_are_welcome_are_those_that_were_named_last() -> None:
+    sightings = Presence()
+    for named in ([ONE, TWO], [TWO, THREE]):
+        sightings.expect(named)
+    welcome = [sightings.is_welcome(Announce(9, 2, uuid_crc(uuid))) for uuid in (ONE, TWO, THREE)]
+    assert welcome == [False, True, True]
+    assert not sightings.is_awaited(Announce(9, 2, uuid_crc(TWO))), "no thread waits for it"
+
+
+def test_a_place_of_two_boards_is_one_more_place_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(presence, "TWIN", 0.0)
+    monkeypatch.setattr(presence, "ROUND", 0.0)
+    sightings = Presence()
+    sightings.add_sighting(seen(ONE, 7))
+    assert not sightings.has_other_place(ONE)
+    sightings.search_again(seen(ONE, 7))
+    assert not sightings.has_other_place(ONE), "it was wrong there, and that is the one place"
+    sightings.conflict("can:y", 7, conflict(7))
+    assert not sightings.has_other_place(ONE), "the same address of another bus"
+    sightings.conflict("can:x", 7, conflict(7))
+    assert sightings.has_other_place(ONE)
+    assert sightings.conflict_at(seen(TWO, 7)) is not None
+    assert sightings.conflict_at(seen(TWO, 8)) is None

@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision.errors import BadDataError, NoRoomError, PolicyError
 from teds_provision.links.can.airtime import CanAirtime
-from teds_provision.measure.planning import LONGEST, UNSTATED, BusTime, NodePlans, period_of, plan_node, sensors_of
+from teds_provision.measure.planning import BusTime, NodePlans, period_of, plan_node, sensors_of
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
@@ -61,12 +61,12 @@ def test_more_than_four_streams_are_put_together_at_the_slowest_period_and_event
         (0.01, 100.0, False, 10_000_000),
         (0.01, 50.0, True, 20_000_000),
         (0.01, 200.0, True, 10_000_000),
-        (math.nan, None, False, UNSTATED),
-        (0.0, None, False, UNSTATED),
+        (math.nan, None, False, 100_000_000),
+        (0.0, None, False, 100_000_000),
         (-1.0, 50.0, False, 20_000_000),
-        (math.inf, None, True, UNSTATED),
-        (1e6, None, False, LONGEST),
-        (math.nan, 1e-4, False, LONGEST),
+        (math.inf, None, True, 100_000_000),
+        (1e6, None, False, 10**12),
+        (math.nan, 1e-4, False, 10**12),
     ],
 )
 def test_a_period_is_that_of_the_rate_and_never_shorter_than_the_datasheets(
@@ -122,3 +122,31 @@ def test_the_sensors_that_are_measured_are_those_that_were_asked_for_in_their_or
             sensors_of(every, wanted, kind)
     with pytest.raises(BadDataError, match="no sensor"):
         sensors_of(every[3:], (), None)
+
+
+def test_frames_of_a_node_are_spread_over_half_of_its_own_time_but_two_milliseconds_at_most() -> None:
+    """The other half is left to commands; a gap of 0 would be none."""
+    gaps = {}
+    for period in (0.1, 0.001, 0.0002):
+        [plan] = plan_node(channels(*[period] * 8), BUS).streams
+        frames = BUS.airtime.frames(plan.length) / (plan.subscribe.n * plan.subscribe.period / 1e9)
+        gaps[period] = plan.subscribe.gap, round(0.5e6 / frames)
+    assert gaps[0.1][0] == 2000
+    for period in (0.001, 0.0002):
+        gap, half = gaps[period]
+        assert 0.98 * half - 1 <= gap <= half, gaps
+
+
+def test_a_plan_says_by_how_much_it_was_slowed_and_a_part_of_a_millionth_is_nothing() -> None:
+    assert plan_node(channels(0.01), BUS, slower=1.0000005).slowed == ""
+    assert plan_node(channels(0.01), BUS, slower=1.000002).slowed.startswith("slowed from 100 Hz to 99.9998 Hz")
+    assert plan_node(channels(0.01, 0.1), BUS, slower=2.0).periods() == {1: 0.02, 2: 0.2}
+
+
+def test_a_message_holds_a_sample_at_least_and_a_sample_that_fits_none_is_refused() -> None:
+    long = [Channel(1, kind=ChannelKind.SENSOR, sample=SampleForm(10, 5000, 0), timing=Timing(period=0.1))]
+    with pytest.raises(BadDataError, match="One sample of channels 1 does not fit into a message"):
+        plan_node(long, BUS)
+    [plan] = plan_node(channels(0.1), BUS, kind=StreamKind.FREE, test_pattern=True, start=7).streams
+    asked = plan.subscribe
+    assert (asked.n, asked.kind, asked.test_pattern, asked.start) == (1, StreamKind.FREE, True, 7)

@@ -16,7 +16,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageError
-from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, SetPointCommand, StationFacts
+from teds_provision.measure.blocks import (
+    Block,
+    ChannelFacts,
+    GroupRows,
+    InvalidValues,
+    NodeReport,
+    SetPointCommand,
+    StationFacts,
+    why_invalid,
+)
 from teds_provision.measure.sinks import names
 from teds_provision.measure.sinks.base import LIVE_WAITING
 from teds_provision.measure.sinks.joints import joints_of
@@ -519,3 +528,82 @@ def test_a_sink_that_is_closed_takes_nothing_and_so_drops_nothing() -> None:
         sink.write(block())
     assert sink.stats.dropped == 0
     assert not sink._items
+
+
+def test_diagnostics_of_a_station_are_held_whole() -> None:
+    """One entry for each report, each datasheet that is not signed, each calibration that is due, and the sink."""
+    facts = [
+        replace(ANGLE, overdue=True, due="2026-01-01"),
+        replace(ANGLE, number=2, unsigned=True),
+        replace(FORCE, unverified=True),
+    ]
+    sink = Carrier()
+    sink._prepare(tuple(facts), STATION)
+    reports = (
+        NodeReport(
+            ARM, "running", samples=100, lost=4, late=3, bad=2, invalid=1, clock_error=0.00123,
+            invalid_why=(InvalidValues(1, "above its high limit", 1), InvalidValues(2, "not a number", 7)),
+        ),
+        NodeReport(HAND, "ended", samples=5),
+    )  # fmt: skip
+    for report in reports:
+        sink._process_item(report)
+    sink._count(dropped=9)
+    sink._set_state("running", "12 messages/s")
+    assert sink._statuses(12.4) == [
+        DiagnosticEntry(
+            1, "arm: measurement", "running", ARM,
+            (("samples", "100"), ("lost", "4"), ("late", "3"), ("bad", "2"), ("invalid", "1"),
+             ("why invalid", "7 of channel 2: not a number; 1 of channel 1: above its high limit"),
+             ("clock error [s]", "0.0012")),
+        ),
+        DiagnosticEntry(
+            0, "unverified/hand: measurement", "ended", HAND,
+            (("samples", "5"), ("lost", "0"), ("late", "0"), ("bad", "0"), ("invalid", "0")),
+        ),
+        DiagnosticEntry(1, "arm: datasheet", "unsigned: raw values only, not published on any topic", ARM),
+        DiagnosticEntry(
+            1, "unverified/hand: datasheet", "unverified: values are calibrated by an unsigned datasheet", HAND
+        ),
+        DiagnosticEntry(1, "arm: calibration of angle", "due since 2026-01-01", ARM),
+        DiagnosticEntry(
+            1, "bench: carrier", "12 messages/s", "bench", (("messages per second", "12"), ("dropped values", "9"))
+        ),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("sent", "dropped", "detail", "level"),
+    [
+        (0, 0, "0 messages/s", 0),
+        (8000, 0, "4000 messages/s", 0),
+        (10000, 0, "5000 messages/s", 0),
+        (10002, 0, "5001 messages/s, above the 5000 that one process can handle: lower --scalar-rate", 1),
+        (8000, 1, "4000 messages/s", 1),
+    ],
+)
+def test_a_sink_says_once_a_second_how_much_it_sends_and_when_that_is_too_much(
+    sent: int, dropped: int, detail: str, level: int
+) -> None:
+    sink = Carrier()
+    sink._prepare((), STATION)
+    sink._set_state("running")
+    sink._second = 100.0
+    sink._went(3, messages=sent)
+    sink._count(dropped=dropped)
+    sink._idle(100.9)
+    assert sink.statuses == []
+    sink._idle(102.0)
+    [own] = sink.statuses
+    assert (sink.stats.detail, own.message, own.level) == (detail, detail, level)
+    sink._idle(103.5)
+    assert sink.stats.detail == "0 messages/s", "each second is counted anew"
+
+
+def test_of_many_reasons_the_three_most_frequent_are_named() -> None:
+    found = [
+        InvalidValues(number, f"why {number}", count) for number, count in ((1, 2), (2, 9), (3, 1), (4, 5), (5, 3))
+    ]
+    assert why_invalid(found) == "9 of channel 2: why 2; 5 of channel 4: why 4; 3 of channel 5: why 5; 3 more"
+    assert why_invalid(found[:3]) == "9 of channel 2: why 2; 2 of channel 1: why 1; 1 of channel 3: why 3"
+    assert why_invalid([]) == ""
