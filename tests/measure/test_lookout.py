@@ -505,11 +505,11 @@ def test_a_node_that_is_tried_again_says_when_and_for_how_long(monkeypatch: pyte
 def test_the_same_trouble_with_addresses_is_noted_every_ten_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
     now, notes = [1000.0], list[str]()
     monkeypatch.setattr(presence, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    sightings = Presence(note=notes.append)
+    sightings = Presence(note=lambda text: notes.append(f"{text} at {now[0] - 1000.0:g}"))
     for at, text in ((0.0, "one"), (1.0, "two"), (599.0, "one"), (600.0, "one"), (600.5, "two"), (601.5, "two")):
         now[0] = 1000.0 + at
         sightings.report(text)
-    assert notes == ["one", "two", "one", "two"]
+    assert notes == ["one at 0", "two at 1", "one at 600", "two at 601.5"]
     for number in range(1100):
         sightings.report(str(number))
     assert len(sightings._reported) == 1024, "who makes up addresses fills no memory"

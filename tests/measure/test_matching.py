@@ -147,3 +147,108 @@ def test_an_unsigned_node_is_one_whose_datasheet_was_read_in_a_session(
         measurements=SimpleNamespace(detection=mode), datasheets=SimpleNamespace(datasheet=lambda _uuid: object())
     )
     assert matching.UnsignedNodes().why_not(station, bytes(10)) == why
+
+
+ARM, LEG, BARE, GUEST = (bytes([number]) * 10 for number in range(1, 5))
+
+
+def station_of(**more: Any) -> Any:
+    """Return a station with an arm, a leg, a node without name and type, and one that it has no row of."""
+    rows = {
+        ARM: SimpleNamespace(uuid=ARM, profile="angle-sensor", name="arm-1"),
+        LEG: SimpleNamespace(uuid=LEG, profile="gripper", name="leg"),
+        BARE: SimpleNamespace(uuid=BARE, profile=None, name=None),
+    }
+    groups = {"left": SimpleNamespace(uuids=(ARM, LEG)), "right": SimpleNamespace(uuids=(LEG,))}
+    parts = {
+        "nodes": SimpleNamespace(get=rows.get, all=rows.values),
+        "groups": SimpleNamespace(find=groups.get),
+        "datasheets": SimpleNamespace(datasheet=lambda uuid: None if uuid in (BARE, GUEST) else uuid),
+    }
+    return SimpleNamespace(**parts | more)
+
+
+@pytest.mark.parametrize(
+    ("text", "uuid", "why"),
+    [
+        ("all", GUEST, ""),
+        ("type:angle-sensor", ARM, ""),
+        ("type:angle-sensor", LEG, "its type is gripper, not angle-sensor"),
+        ("type:angle-sensor,type:gripper", ARM, "its type is angle-sensor, not gripper"),
+        ("type:gripper", BARE, "its type is unknown, and its datasheet does not fit gripper: none is known"),
+        ("type:gripper", GUEST, "its type is unknown, and its datasheet does not fit gripper: none is known"),
+        ("name:arm-*", ARM, ""),
+        ("name:ARM-*", ARM, "its name 'arm-1' is not ARM-*"),
+        ("name:*,name:leg", ARM, "its name 'arm-1' is not leg"),
+        ("name:*", BARE, ""),
+        ("name:?*", BARE, "its name '' is not ?*"),
+        ("left", ARM, ""),
+        ("group:left,right", ARM, "it is not in group right"),
+        ("right", LEG, ""),
+        ("gone", LEG, "it is not in group gone"),
+        ("angle >= 1 deg", BARE, "its datasheet is unknown"),
+        ("left,type:gripper,name:leg,right", LEG, ""),
+    ],
+)
+def test_all_terms_must_hold_and_the_first_that_does_not_is_the_reason(text: str, uuid: bytes, why: str) -> None:
+    assert NodeMatch.parse(text).why_not(station_of(), uuid) == why
+
+
+@pytest.mark.parametrize(
+    ("fits", "why"),
+    [([], "its datasheet is unknown"), (["The range is 90 deg.", "No rate."], "The range is 90 deg"), (None, "")],
+)
+def test_a_bound_holds_for_the_stored_datasheet_and_is_said_without_its_full_stop(
+    fits: list[str] | None, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(matching, "Sheet", SimpleNamespace(from_image=lambda image: image))
+    monkeypatch.setattr(matching, "judge", lambda _fits, _sheet, _now: [SimpleNamespace(why=why) for why in fits or []])
+    monkeypatch.setattr(matching, "met", lambda _fits, _judged: fits is None)
+    assert NodeMatch.parse("angle >= 1 deg").why_not(station_of(), ARM) == why
+
+
+def test_nodes_that_may_not_be_measured_are_no_match_whatever_the_expression(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matching, "why_not_measured", lambda _station, uuid: "it was revoked" if uuid == ARM else "")
+    found = matching.survey(station_of(), NodeMatch.parse("name:*-1"))
+    assert found.matching == ()
+    assert found.others == {
+        ARM.hex(): "it was revoked", LEG.hex(): "its name 'leg' is not *-1", BARE.hex(): "its name '' is not *-1",
+    }  # fmt: skip
+    assert matching.survey(station_of(), NodeMatch.parse("right")).matching == (LEG.hex(),)
+
+
+def test_a_type_is_unknown_if_neither_a_profile_nor_a_node_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[str]()
+
+    def find(search: Any) -> list[bytes]:
+        asked.append(search.profile)
+        return [LEG] if search.profile == "kept" else []
+
+    station = station_of(overview=SimpleNamespace(find=find))
+    monkeypatch.setattr(matching, "_is_profile", lambda kind, _station: kind == "gripper")
+    assert NodeMatch.parse("type:gripper,type:kept").unknown_type(station) == ""
+    said = NodeMatch.parse("type:gripper,type:gone,name:x").unknown_type(station)
+    assert said == "no profile and no known node is called 'gone'"
+    assert asked == ["kept", "gone"]
+    assert NodeMatch.parse("all").unknown_type(station) == ""
+
+
+@pytest.mark.parametrize(
+    ("listed", "verdict", "why"),
+    [
+        (True, "authentic", ""),
+        (True, "unsigned", "it was not adopted here"),
+        (True, None, "it was not adopted here"),
+        (False, "authentic", "it was not adopted here"),
+    ],
+)
+def test_a_node_that_was_adopted_while_it_was_measured_is_measured_on_once_it_is_signed(
+    listed: bool, verdict: str | None, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = None if verdict is None else SimpleNamespace(verified=SimpleNamespace(verdict=verdict))
+    monkeypatch.setattr(matching, "verdict_of", lambda _station, _uuid: judged)
+    adopted = set[bytes]()
+    nodes = matching.ListedNodes(adopted)
+    if listed:
+        adopted.add(ARM)  # the list grows while it is used
+    assert nodes.why_not(station_of(), ARM) == why

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import math
+import threading
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision.measure.blocks import SinkStats
+from teds_provision.errors import (
+    BadDataError,
+    LinkError,
+    NoNodeError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+    TedsProvisionError,
+)
+from teds_provision.measure.blocks import SinkStats, StationFacts
+from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running import measurement
 from teds_provision.measure.running.measurement import WAITING, Measurement
+from teds_provision.measure.running.streams import StreamTotals
 
 
 def test_a_sink_that_waits_for_its_consumers_is_news_after_three_seconds_each_time_anew(
@@ -87,3 +100,196 @@ def test_the_seconds_of_a_measurement_count_from_the_first_sample_of_its_last_st
     assert until(100.0, 5.0, 0.0, 100.4, 101.5) == 106.5
     assert until(100.0, 5.0, 2.0, 101.5) == 107.0
     assert began == [True] * 3
+
+
+UUIDS = bytes(10), bytes([1]) * 10, bytes([2]) * 10
+
+
+def measurement_of(*supervisors: Any, sinks: Any = (), request: Any = None, **more: Any) -> Any:
+    """Return a measurement of these supervisors that does not run."""
+    none: Any = None
+    made: Any = Measurement(none, none, UUIDS, request or MeasurementRequest(), sinks, StationFacts("bench"), **more)
+    made.supervisors = list(supervisors)
+    made._by_uuid = {supervisor.uuid: supervisor for supervisor in supervisors}
+    made._common_start = SimpleNamespace(spread=0.25)
+    return made
+
+
+def supervisor_of(uuid: bytes, error: TedsProvisionError | None = None, **more: Any) -> Any:
+    streams = SimpleNamespace(totals={}, running={})
+    facts = {"ever_ran": False, "done": threading.Event(), "ready": threading.Event(), "begun": True} | more
+    return SimpleNamespace(uuid=uuid, error=error, streams=streams, turn=threading.Lock(), **facts)
+
+
+def sink_of(name: str, *, recorder: bool = False, files: tuple[str, ...] = (), **stats: Any) -> Any:
+    return SimpleNamespace(name=name, recorder=recorder, files=files, stats=SinkStats(**stats))
+
+
+def test_the_end_of_a_measurement_has_its_nodes_files_sinks_and_worst_error() -> None:
+    first, second = supervisor_of(UUIDS[0], LinkError("Silent.")), supervisor_of(UUIDS[1])
+    first.streams.totals = {
+        1: StreamTotals((3,), 0.01, messages=9, samples=9, lost=1, clock_error=0.5),
+        0: StreamTotals((1, 2), 0.1, messages=90, lost=10),
+    }
+    sinks = [
+        sink_of("run.csv", recorder=True, files=("/r/run.csv", "/r/run.2.csv"), written=40, dropped=2),
+        sink_of("ROS 2", written=7),
+    ]
+    end = measurement_of(first, second, sinks=sinks)._ended()
+    stream = {"messages": 90, "samples": 0, "lost": 10, "late": 0, "bad": 0, "invalid": 0, "clock_error": None,
+              "invalid_why": ()}  # fmt: skip
+    assert end.nodes == [
+        {
+            "uuid": UUIDS[0].hex(),
+            "streams": [
+                {"channels": [1, 2], "period": 0.1} | stream,
+                {"channels": [3], "period": 0.01} | stream
+                | {"messages": 9, "samples": 9, "lost": 1, "clock_error": 0.5},
+            ],
+            "error": {"code": "link", "message": "Silent."},
+        },
+        {"uuid": UUIDS[1].hex(), "streams": []},
+    ]  # fmt: skip
+    assert (end.files, end.apart, end.lower_rate) == (["/r/run.csv", "/r/run.2.csv"], 0.25, 5.0)
+    assert end.sinks == [
+        {"sink": "run.csv", "written": 40, "dropped": 2},
+        {"sink": "ROS 2", "written": 7, "dropped": 0},
+    ]
+    assert end.error is first.error
+
+
+@pytest.mark.parametrize(
+    ("errors", "sinks", "code", "message"),
+    [
+        ([], [], None, ""),
+        ([LinkError("a"), NotAuthenticError("b"), PolicyError("c")], [], 4, "b"),
+        ([LinkError("a"), PolicyError("c"), StoreError("d")], [], 6, "c"),
+        ([StoreError("d"), LinkError("a")], [], 5, "a"),
+        ([StoreError("d"), BadDataError("e")], [], 7, "d"),
+        ([], [sink_of("f", recorder=True, error="The disk is full.", written=3)], 7, "The disk is full."),
+        ([], [sink_of("f", recorder=True, dropped=3)], None, ""),
+        ([], [sink_of("ROS", dropped=3)], 5, "ROS accepted nothing: all 3 values were dropped."),
+        ([], [sink_of("ROS", dropped=3, error="It is gone.")], 5, "It is gone."),
+        ([], [sink_of("ROS", dropped=3, written=1)], None, ""),
+        ([], [sink_of("ROS", dropped=3, written=1, error="It is gone.")], 1, "It is gone."),
+    ],
+)
+def test_the_worst_error_decides_how_a_measurement_ended(
+    errors: list[TedsProvisionError], sinks: list[Any], code: int | None, message: str
+) -> None:
+    supervisors = [supervisor_of(uuid, error) for uuid, error in zip(UUIDS, errors, strict=False)]
+    worst = measurement_of(*supervisors, sinks=sinks)._ended().error
+    assert (worst and worst.exit_code, worst.message if worst else "") == (code, message)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "lent", "newcomers", "done", "gave_up"),
+    [
+        (["done", "done"], set(), False, True, False),
+        (["done", "runs"], set(), False, False, False),
+        (["done", "done"], {UUIDS[0]}, False, False, False),
+        (["done", "done"], set(), True, False, False),
+        (["silent", "silent"], set(), False, False, True),
+        (["silent", "ran"], set(), False, False, False),
+        (["silent", "link"], set(), False, False, False),
+        (["silent", "silent"], set(), True, False, False),
+    ],
+)
+def test_a_measurement_is_over_when_all_nodes_are_done_or_none_ever_answered(
+    nodes: list[str], lent: set[bytes], newcomers: bool, done: bool, gave_up: bool
+) -> None:
+    errors = {"silent": NoNodeError("Silent."), "ran": NoNodeError("Silent."), "link": LinkError("Torn.")}
+    supervisors = [
+        supervisor_of(uuid, errors.get(node), ever_ran=node == "ran") for uuid, node in zip(UUIDS, nodes, strict=False)
+    ]
+    for supervisor, node in zip(supervisors, nodes, strict=True):
+        if node == "done":
+            supervisor.done.set()
+    made = measurement_of(*supervisors, request=MeasurementRequest(newcomers=newcomers), lent=lent)
+    assert (made._all_done(), made._gave_up()) == (done, gave_up)
+
+
+def test_who_never_came_is_an_error_of_that_node_alone() -> None:
+    came, refused, absent = (
+        supervisor_of(UUIDS[0], ever_ran=True), supervisor_of(UUIDS[1], PolicyError("No.")), supervisor_of(UUIDS[2])
+    )  # fmt: skip
+    measurement_of(came, refused, absent)._note_who_never_came()
+    assert (came.error, refused.error.message) == (None, "No.")
+    assert absent.error.message == f"Node {UUIDS[2].hex()} did not answer before the measurement ended."
+
+
+def test_a_session_is_lent_for_one_command_while_the_node_is_measured() -> None:
+    trusted = object()
+    supervisor = supervisor_of(UUIDS[0], verified=trusted, state="waiting")
+    made = measurement_of(supervisor)
+    for state, streaming, given in (
+        ("waiting", False, trusted), ("waiting", True, None), ("running", True, trusted),
+    ):  # fmt: skip
+        supervisor.state = state
+        with made.session(UUIDS[0], streaming=streaming) as session:
+            assert session is given
+            assert supervisor.turn.locked()
+        assert not supervisor.turn.locked()
+    with made.session(UUIDS[1]) as session:
+        assert session is None
+
+
+def test_a_node_that_is_let_go_keeps_its_place_and_one_that_never_began_is_free_at_once() -> None:
+    course = list[Any]()
+    began = supervisor_of(UUIDS[0], stop=lambda why, **how: course.append((why, how)))
+    made = measurement_of(began, supervisor_of(UUIDS[1], begun=False), lent=set())
+    assert made.suspend_node(UUIDS[0], "let go for write", 0.0) is False
+    began.done.set()
+    assert made.suspend_node(UUIDS[0], "let go for write", 0.0) is True
+    assert course == [("let go for write", {"comes_back": True})] * 2
+    assert [made.suspend_node(uuid, "x", 0.0) for uuid in UUIDS[1:]] == [True, True]
+    assert made.lent == {*UUIDS}
+
+
+def test_sinks_that_were_opened_before_one_that_cannot_be_leave_no_empty_recording(tmp_path: Path) -> None:
+    course = list[str]()
+
+    def sink(name: str, *, recorder: bool, fails: bool = False) -> Any:
+        file = tmp_path / name
+
+        def open_(_facts: object, _station: object) -> None:
+            if fails:
+                raise StoreError("No folder.")
+            file.write_text("head")
+
+        return SimpleNamespace(
+            open=open_, close=lambda: course.append(f"{name} closed"), recorder=recorder, files=(str(file),)
+        )
+
+    sinks = [sink("a.csv", recorder=True), sink("socket", recorder=False), sink("b.csv", recorder=True, fails=True)]
+    with pytest.raises(StoreError, match="No folder"):
+        measurement_of(sinks=sinks).run(threading.Event())
+    assert course == ["a.csv closed", "socket closed"]
+    assert [path.name for path in tmp_path.iterdir()] == ["socket"]
+
+
+def test_who_holds_up_a_trigger_is_named_once_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    notes, pulled, due = list[str](), list[str](), [False]
+    monkeypatch.setattr(measurement.trigger, "pull", lambda *_words: pulled.append("pulled"))
+    supervisors = [supervisor_of(bytes([number]) * 10) for number in range(5)]
+    made = measurement_of(*supervisors, request=MeasurementRequest(trigger=True))
+    made.watcher = measurement.Watcher(note=notes.append)
+    asked = list[tuple[int, int]]()
+
+    def is_due(ready: int, all_of: int) -> bool:
+        asked.append((ready, all_of))
+        return due[0]
+
+    made._common_start = SimpleNamespace(due=is_due, notice_due=lambda: True)
+    made._trigger()
+    assert notes == [], "none is ready, so none waits"
+    supervisors[0].ready.set()
+    made._trigger()
+    names = ", ".join(f"{number:02x}" * 10 for number in (1, 2, 3))
+    assert notes == [f"Waiting for {names} … before the trigger, up to 15 s."]
+    due[0] = True
+    made._trigger()
+    assert (asked, pulled, len(notes)) == ([(0, 5), (1, 5), (1, 5)], ["pulled"], 1)
+    made.request = MeasurementRequest()
+    made._trigger()
+    assert pulled == ["pulled"]

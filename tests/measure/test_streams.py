@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from teds_provision.errors import NodeRefusedError
+from teds_provision.measure.blocks import InvalidValues
 from teds_provision.measure.clock import HostClock
-from teds_provision.measure.running.streams import SILENT, NodeStreams
+from teds_provision.measure.running.streams import SILENT, NodeStreams, StreamTotals
 from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.protocol.operation.subscription import Counts
 
 
 class Bus:
@@ -66,3 +68,85 @@ def test_events_and_what_waits_for_a_trigger_may_be_silent_and_other_streams_for
     assert streams.silent(now) == pytest.approx(SILENT + 0.7)
     assert streams.heard_since(now - SILENT - 0.8)
     assert not streams.heard_since(now - SILENT - 0.6)
+
+
+def heard(messages: int, samples: int, bound: float | None, **counts: int) -> Any:
+    """Return a run of a stream that counted so; each kind of bad message has a digit of its own."""
+    return SimpleNamespace(
+        receiver=SimpleNamespace(counts=Counts(good=messages, **counts)),
+        samples=samples,
+        wrong_pattern=700_000,
+        pieces=SimpleNamespace(wrong=6_000_000),
+        interpreter=SimpleNamespace(invalid=(InvalidValues(1, "too high", 3), InvalidValues(2, "too high", 1))),
+        bound=bound,
+    )
+
+
+def test_what_is_counted_of_a_stream_goes_on_from_run_to_run() -> None:
+    totals = StreamTotals((1, 2), 0.01)
+    first = heard(5, 50, 0.002, lost=1, late=1, stale=20, overflow=300, bad=1, junk=20, future=300, back=4_000,
+                  unasked=50_000, cut=9)  # fmt: skip
+    now = totals.with_run(first)
+    assert (totals.samples, totals.with_run(None)) == (0, totals)
+    assert now == StreamTotals(
+        (1, 2), 0.01, messages=5, samples=50, lost=1, late=321, bad=6_754_321, invalid=4, clock_error=0.002,
+        invalid_why=(InvalidValues(1, "too high", 3), InvalidValues(2, "too high", 1)),
+    )  # fmt: skip
+    again = now.with_run(heard(2, 20, None))
+    assert (again.messages, again.samples, again.lost, again.bad) == (7, 70, 1, 6_754_321 + 6_700_000)
+    assert (again.invalid, again.clock_error) == (8, 0.002), "the last bound that was known"
+    assert again.with_run(heard(1, 10, 0.001)).clock_error == 0.001
+
+
+@pytest.mark.parametrize(
+    ("period", "messages", "lost", "rate"),
+    [(0.01, 90, 10, 50.0), (0.01, 90, 0, None), (0.01, 0, 10, None), (0.0, 90, 10, None)],
+)
+def test_a_lower_rate_is_proposed_for_a_stream_that_lost_some_of_its_messages(
+    period: float, messages: int, lost: int, rate: float | None
+) -> None:
+    assert StreamTotals((1,), period, messages=messages, lost=lost).lower_rate == rate
+
+
+@pytest.mark.parametrize(
+    ("wanted", "waited", "finished"), [(7, [7, 7], (9, 7)), (9, [9, 9], (9, 9)), (0, [0, 9], (9, 9))]
+)
+def test_a_stream_that_is_stopped_is_heard_out_to_what_was_wanted_of_it(
+    wanted: int, waited: list[int], finished: tuple[int, int]
+) -> None:
+    """What was begun after the end that the station wanted is not lost; without a session nobody is asked."""
+    bus: Any = Bus()
+    course = list[Any]()
+    bus.hear_out = lambda _stream, due: course.append(due)
+    for answers in (True, False):
+        streams = NodeStreams(HostClock(), lambda _block: None)
+        stream = heard(5, 50, None)
+        stream.ending = lambda: wanted
+        stream.receiver.finish = lambda *counters: course.append(counters)
+        streams.running[2] = stream
+        streams.totals[2] = StreamTotals((1,), 0.01)
+        node = SimpleNamespace(request=lambda _command, _doing: (9).to_bytes(4, "big"))
+        streams.stop(bus, cast(Any, SimpleNamespace(node=node)) if answers else None, 0x21)
+        assert course == ([*waited, finished] if answers else [])
+        assert (bus.course, streams.running, streams.totals[2].samples) == ([("forgotten", 2)], {}, 50)
+        course.clear()
+        bus.course.clear()
+
+
+def test_values_that_come_before_their_channels_are_described_are_held_and_keep_their_order() -> None:
+    came = list[Any]()
+    streams = NodeStreams(HostClock(), came.append)
+    before = streams.clock
+    for session in range(2):
+        streams.new_session()
+        streams._run = 5
+        streams._deliver(cast(Any, f"{session} early"))
+        streams._deliver(cast(Any, f"{session} next"))
+        assert came == []
+        streams.described()
+        streams._deliver(cast(Any, f"{session} late"))
+        assert came == [f"{session} early", f"{session} next", f"{session} late"]
+        came.clear()
+    streams._deliver(cast(Any, "on"))
+    streams.new_session()
+    assert (came, streams._run, streams.clock is before) == (["on"], 0, False)

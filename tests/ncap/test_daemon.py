@@ -12,7 +12,7 @@ import pytest
 from teds_provision.errors import FrozenError, NewerStoreError, NotFoundError, StoreError, UsageError, VaultLockedError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.nodes.link_watch import LinkState
-from teds_provision.ncap.settings import Settings
+from teds_provision.ncap.settings import Settings, own_source, parse_http, require_safe
 from teds_provision.station.store.audit import AuditFilter
 from tests.bench import copied_station
 
@@ -181,3 +181,54 @@ def test_a_node_is_told_to_blink_in_the_session_in_which_it_is_measured(
     node.sealed = False
     bench.daemon.locate(NODE, 3)
     assert told == [(node, 3), (NODE, "locate")]
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("8351", ("127.0.0.1", 8351)),
+        ("127.0.0.1:8351", ("127.0.0.1", 8351)),
+        ("[::1]:0", ("::1", 0)),
+        ("bench:65535", ("bench", 65535)),
+        ("bench:65536", None),
+        (":8351", None),
+        ("[]:8351", None),
+        ("bench", None),
+        ("bench:", None),
+        ("bench:-1", None),
+        ("", None),
+    ],
+)
+def test_the_address_of_the_page_is_host_and_port_or_a_port_of_this_machine(
+    text: str, address: tuple[str, int] | None
+) -> None:
+    if address is None:
+        with pytest.raises(UsageError, match="is not HOST:PORT"):
+            parse_http(text)
+    else:
+        assert parse_http(text) == address
+
+
+def test_a_daemons_address_on_a_bus_follows_from_its_store_and_leaves_the_command_lines_free() -> None:
+    """CRC-32 of the ID, into the six addresses of daemons: two stations on one bus seldom collide."""
+    assert [own_source(name) for name in ("a", "b", "bench", "")] == [0xF5, 0xF7, 0xF5, 0xF2]
+    assert {own_source(str(number)) for number in range(200)} == {0xF2, 0xF3, 0xF4, 0xF5, 0xF6, 0xF7}
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (Settings(http=("192.168.1.2", 8351)), "--http 192.168.1.2 would send values and tokens"),
+        (Settings(foxglove="192.168.1.2:8765"), "192.168.1.2 would send values"),
+        (Settings(certificate=Path("cert.pem")), "must be used together"),
+        (Settings(key=Path("key.pem"), http=("127.0.0.1", 1)), "must be used together"),
+        (Settings(http=("127.0.0.1", 8351), foxglove="8765"), None),
+        (Settings(), None),
+    ],
+)
+def test_a_service_that_others_could_listen_to_is_refused_at_its_start(settings: Settings, words: str | None) -> None:
+    if words is None:
+        require_safe(settings)
+        return
+    with pytest.raises(UsageError, match=words):
+        require_safe(settings)
