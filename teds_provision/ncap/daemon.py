@@ -248,8 +248,9 @@ class Daemon:
                 if version == self._version:
                     continue
                 self.station.require_known_schema()
+                if not self.directory.refresh():
+                    continue  # the change is read at the next look
                 self._version = version
-                self.directory.refresh()
                 self.names.forget()
                 self.live.event("store", state="changed")
             except NewerStoreError as newer:
@@ -259,6 +260,8 @@ class Daemon:
                 return
             except StoreError as failure:  # temporary: the next read may succeed
                 _log.warning("The store cannot be read: %s", failure.message)
+            except Exception:  # noqa: BLE001 - a thread that ends without a word would follow no change any more
+                _log.exception("Following the changes of the store failed; it goes on.")
 
     def _look_at_vault(self) -> None:
         """Report when another command locks this process out of the vault, and when it is open again."""

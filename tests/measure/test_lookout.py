@@ -530,9 +530,10 @@ def test_a_node_is_gone_once_however_often_it_is_waited_for_in_vain() -> None:
     assert sightings.gone == 2
 
 
-def test_who_stops_waiting_for_a_node_is_told_that_it_did_not_answer() -> None:
+def test_who_stops_waiting_for_a_node_is_told_that_it_did_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = threading.Event()
     stopped.set()
+    monkeypatch.setattr(threading.Condition, "wait", lambda _news, _seconds: pytest.fail("it waits on"))
     with pytest.raises(NoNodeError):
         Presence().find(ONE, seconds=PATIENCE, stop=stopped)
 

@@ -121,20 +121,26 @@ def test_what_another_process_changed_in_the_store_is_read_again_names_of_topics
     daemon, version, done = bench.daemon, [daemon_version := object()], list[str]()
     daemon._version = daemon_version
     monkeypatch.setattr(bench.station, "version", lambda: version[0])
-    monkeypatch.setattr(daemon.directory, "refresh", lambda *_uuids: done.append("nodes"))
+    readable = [False, True]
+    monkeypatch.setattr(daemon.directory, "refresh", lambda *_uuids: done.append("nodes") or readable.pop(0))
     monkeypatch.setattr(daemon.names, "forget", lambda: done.append("names"))
     monkeypatch.setattr(daemon.directory, "follow_profiles", lambda: [NODE])
     looks(bench, 1)
     assert (done, bench.events) == ([], [("node", "changed")])
     version[0] = object()
-    looks(bench, 2)
-    assert (done, bench.events.count(("store", "changed"))) == (["nodes", "names"], 1)
+    looks(bench, 3)
+    assert (done, bench.events.count(("store", "changed"))) == (["nodes", "nodes", "names"], 1), "until it can be read"
 
 
 def test_a_store_that_fails_is_looked_at_again_and_one_of_a_newer_version_ends_the_service(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failures: list[Exception | None] = [StoreError("The disk is away."), None, NewerStoreError("Schema 99.", hint="x")]
+    failures: list[Exception | None] = [
+        StoreError("The disk is away."),
+        OSError(),
+        None,
+        NewerStoreError("Schema 99.", hint="x"),
+    ]
     ended: list[bool] = []
     bench.daemon._ends = lambda: ended.append(True)
 

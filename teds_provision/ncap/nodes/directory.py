@@ -88,12 +88,17 @@ class NodeDirectory:
 
     # -- the store ---------------------------------------------------------------------------------------------------
 
-    def refresh(self, uuids: Iterable[str] | None = None) -> None:
-        """Read the rows of these nodes again, or of all in the store; datasheets when they are requested."""
+    def refresh(self, uuids: Iterable[str] | None = None) -> bool:
+        """Read the rows of these nodes again, or of all in the store; datasheets when they are requested.
+
+        False if the store cannot be read: the last known rows remain.
+        """
         try:
             self._refresh(uuids)
-        except StoreError as failure:  # the last known rows remain; the daemon's check of the store reports the error
+        except StoreError as failure:
             _log.warning("The nodes cannot be read from the store: %s", failure.message)
+            return False
+        return True
 
     def _refresh(self, uuids: Iterable[str] | None) -> None:
         with self._reading:  # so that an older reading never overwrites a newer one

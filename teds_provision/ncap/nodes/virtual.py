@@ -319,29 +319,41 @@ class Virtuals:
         while not self._stop.is_set() and virtual.uuid in self._all:
             words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(virtual.folder)]
             words += ["--can", self.bus]
-            daemon = os.getpid()
-            with every_core(), log.open("wb") as errors, opened_folder(virtual.folder) as folder:
-                fed = virtual.source == SIMULATION
-                words += ["--source", f"{SIMULATION}:{short_path(folder)}" if fed else virtual.source]
-                process = virtual.process = subprocess.Popen(
-                    words,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=errors,
-                    pass_fds=(folder,) if fed else (),
-                    process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
-                    preexec_fn=lambda: _die_with(daemon),  # noqa: PLW1509, B023 - two calls of the system, nothing else
-                )
+            try:
+                process = virtual.process = self._begun(virtual, words, log)
+            except OSError as error:  # no memory or descriptor for a process, or its folder is gone
+                self._publish_state(virtual, "ended", f"It cannot be started: {error.strerror}.")
+                self._stop.wait(pause)
+                pause = min(2 * pause, _LONGEST)
+                continue
             if self._stop.is_set() or virtual.uuid not in self._all:
                 _end(process)
             if self._until_its_end(virtual, process):
                 pause = _AGAIN
             if self._stop.is_set() or virtual.uuid not in self._all:
                 return
-            last = log.read_text(errors="replace").strip().splitlines()
+            last: list[str] = []
+            with suppress(OSError):
+                last = log.read_text(errors="replace").strip().splitlines()
             self._publish_state(virtual, "ended", last[-1] if last else "")
             self._stop.wait(pause)
             pause = min(2 * pause, _LONGEST)
+
+    @staticmethod
+    def _begun(virtual: Virtual, words: list[str], log: Path) -> subprocess.Popen[bytes]:
+        daemon = os.getpid()
+        with every_core(), log.open("wb") as errors, opened_folder(virtual.folder) as folder:
+            fed = virtual.source == SIMULATION
+            source = f"{SIMULATION}:{short_path(folder)}" if fed else virtual.source
+            return subprocess.Popen(
+                [*words, "--source", source],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                pass_fds=(folder,) if fed else (),
+                process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
+                preexec_fn=lambda: _die_with(daemon),  # noqa: PLW1509 - two calls of the system, nothing else
+            )
 
     def _until_its_end(self, virtual: Virtual, process: subprocess.Popen[bytes]) -> bool:
         """Read its lines until it ends; whether it ever was ready."""
