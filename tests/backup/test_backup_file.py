@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import shutil
 import subprocess
@@ -10,15 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.kdf.argon2 import Argon2id
 
+from teds_provision import __version__
 from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.restore import open_present
 from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, WrongPassphraseError
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import SoftwareKey, verify
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
-from tests.backup.backups import ONE, POINT, TWO, back_up, copy_of, opened, opened_octets, restored_into
+from tests.backup.backups import ONE, POINT, SEALED, TWO, back_up, copy_of, opened, opened_octets, restored_into
 
 
 def test_the_file_is_private_whole_and_holds_no_secret(station: Station, tmp_path: Path) -> None:
@@ -34,6 +39,42 @@ def test_the_file_is_private_whole_and_holds_no_secret(station: Station, tmp_pat
     assert ONE.hex().encode() not in octets
     assert [left.name for left in tmp_path.iterdir() if left.name.startswith(".")] == []
     assert "material" not in repr(opened(path))
+
+
+def test_a_backup_is_opened_by_its_description_alone(station: Station, tmp_path: Path) -> None:
+    """By hashes, Argon2id and AES-GCM: a backup of today must open in every later version."""
+    path = tmp_path / "station.backup"
+    back_up(station, path)
+    octets = path.read_bytes()
+    line, _, chunks = octets.partition(b"\n")
+    head = json.loads(line)
+    assert list(head) == ["format", "store", "station", "created", "key", "sha256"]
+    clear = {name: head[name] for name in ("format", "store", "station", "created")}
+    assert (clear["format"], clear["store"], clear["station"]) == ("teds-backup/2", station.id, station.fingerprint)
+
+    def canonical(members: dict[str, object]) -> bytes:
+        return json.dumps(members, separators=(",", ":"), ensure_ascii=False).encode()
+
+    rest = {name: head[name] for name in head if name != "sha256"}
+    assert head["sha256"] == hashlib.sha256(canonical(rest)).hexdigest()
+    sealed = head["key"]
+    salt, nonce, ciphertext = (base64.b64decode(sealed[name]) for name in ("salt", "nonce", "ciphertext"))
+    under = Argon2id(
+        salt=salt, length=32, iterations=sealed["iterations"], lanes=sealed["lanes"], memory_cost=sealed["memory_kib"]
+    ).derive(SEALED.encode())
+    key = AESGCM(under).decrypt(nonce, ciphertext, b"teds-backup/2\0" + canonical(clear))
+    assert len(key) == 32
+    bound = hashlib.sha256(line + b"\n").digest()
+    content = AESGCM(key).decrypt(bytes(11) + b"\1", chunks.removesuffix(b"teds-backup end\n"), bound)
+    inner, _, rows = content.partition(b"\n")
+    assert json.loads(inner) == {
+        "format": "teds-backup/2", "store": station.id, "station": station.fingerprint, "point": station.point.hex(),
+        "name": station.name, "created": clear["created"], "keystore": "file", "version": __version__,
+        "material": station.vault.secret_material(),
+    }  # fmt: skip
+    signed, signature = content[:-64], content[-64:]
+    assert verify(station.point, b"TEDS1 backup\0" + bound + hashlib.sha256(signed).digest(), signature)
+    assert rows.startswith(b"".join(station.rows())[:40]), "then the rows (docs/store.md), of one moment"
 
 
 def test_a_wrong_passphrase_and_every_kind_of_damage_are_distinguished(station: Station, tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ COUNTED = Job(
 )  # fmt: skip
 LISTED = replace(
     COUNTED, count=None, boards={B: SHA2, A: SHA}, stations={WEST: 900}, sign=OFFICE, evidence=False, assurance="bus",
-    read_only=((0, 1), (65535, 255)), name="left {unit:03}", calibration=CalibrationRule("one", SHA2),
+    read_only=((0, 0), (65535, 255)), name="left {unit:03}", calibration=CalibrationRule("one", SHA2),
 )  # fmt: skip
 PAYLOAD: dict[str, Any] = {
     "format": "teds-job/1", "id": ID, "registry": REGISTRY, "title": "500 fingers", "profile": "tactile",
@@ -55,7 +55,7 @@ PAYLOAD: dict[str, Any] = {
 OF_LISTED = {
     "calibration": {"rule": "one", "sha256": SHA2}, "stations": {WEST: 900}, "assurance": "bus", "sign": OFFICE,
     "nodes": {"list": [{"uuid": B.hex(), "fingerprint": SHA2}, {"uuid": A.hex(), "fingerprint": SHA}]},
-    "evidence": False, "read_only": [[0, 1], [65535, 255]], "name": "left {unit:03}",
+    "evidence": False, "read_only": [[0, 0], [65535, 255]], "name": "left {unit:03}",
 }  # fmt: skip
 
 
@@ -134,6 +134,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no station": ({"stations": {}}, "stations is no object of 1 to 256 stations"),
     "257 stations": ({"stations": MANY}, "stations is no object of 1 to 256 stations"),
     "a negative allotment": ({"stations": {WEST: -1}}, "does not give each fingerprint an allotment"),
+    "a list of stations": ({"stations": [WEST]}, "stations is no object of 1 to 256 stations"),
+    "one good station": ({"stations": {WEST: 1, "west": 1}}, "does not give each fingerprint an allotment"),
     "a name as station": ({"stations": {"west": 1}}, "does not give each fingerprint an allotment"),
     "count 0": ({"nodes": {"count": 0}}, "count is no whole number of 1 to 4294967295"),
     "count and list": ({"nodes": {"count": 5, "list": []}}, "nodes is not one of count and list"),
@@ -149,6 +151,11 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "0 days": ({"calibration": {"rule": "any", "max_age_days": 0}}, "max_age_days is no whole number of 1"),
     "an empty list": ({"calibration": {"rule": "list", "by_uuid": {}}}, "by_uuid is no object of 1 to 32768 boards"),
     "a list of names": ({"calibration": {"rule": "list", "by_uuid": {"a": SHA}}}, "does not give each UUID a SHA-256"),
+    "a list of a list": ({"calibration": {"rule": "list", "by_uuid": [A.hex()]}}, "by_uuid is no object of 1 to 32768"),
+    "one good digest": (
+        {"calibration": {"rule": "list", "by_uuid": {A.hex(): SHA, B.hex(): "b"}}},
+        "does not give each UUID",
+    ),
     "a list of texts": ({"calibration": {"rule": "list", "by_uuid": {A.hex(): "a"}}}, "does not give each UUID"),
     "assurance": ({"assurance": "import"}, "assurance is none of uuid, bus, tap"),
     "an office by name": ({"sign": "office"}, "sign is no SHA-256"),
