@@ -247,9 +247,8 @@ class Nodes:
 
     def named(self, name: str) -> bytes | None:
         """Return the UUID of the only node of exactly this name, None if none or several have it."""
-        statement = "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ? LIMIT 2"
-        rows = self._store.execute(statement, (name, name))
-        return bytes(rows[0][0]) if len(rows) == 1 else None
+        found = self.all_named(name)
+        return found[0] if len(found) == 1 else None
 
     def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
         """Return who has each of these names (a chunk of them), in the nodes or in the whitelist."""

@@ -142,6 +142,50 @@ PATTERNS = (
     ),
     # what a draw of changes found that no test noticed (protocol, station, handover, teds)
     Pattern(
+        "a name that a node has lost since finds it no more",
+        "Nodes.named",
+        "self.all_named(name)",
+        "[uuid for (uuid,) in self._store.execute('SELECT uuid FROM nodes WHERE name = ? UNION"
+        " SELECT uuid FROM whitelist WHERE name = ?', (name, name))]",
+        "tests/station/test_nodes.py",
+    ),
+    Pattern(
+        "the longest silent session without a claim gives way",
+        "Sessions._make_room",
+        "min(idle)",
+        "max(idle)",
+        "tests/protocol/test_room_for_sessions.py",
+    ),
+    Pattern(
+        "a chain that is folded again has the bans judged that it had lifted",
+        "Claims.forget",
+        "self._store.execute('INSERT OR IGNORE INTO to_judge SELECT uuid FROM statements WHERE lifts = 0"
+        " AND uuid IS NOT NULL AND hash IN (SELECT hash FROM statements WHERE chain = ? AND lifts = 1)', (chain,))",
+        "None",
+        "tests/station/test_plant_rows.py",
+    ),
+    Pattern(
+        "a wrapped key is bound to its slot",
+        "node_key_context",
+        "slot.to_bytes(4, 'big')",
+        "slot.to_bytes(2, 'big')",
+        "tests/vault/test_formats.py",
+    ),
+    Pattern(
+        "a removed station's signatures count up to the lower of its two pages",
+        "limit_of",
+        "min(member.signed, member.last, key=lambda place: place[0])",
+        "max(member.signed, member.last, key=lambda place: place[0])",
+        "tests/plant/test_roster_rules.py",
+    ),
+    Pattern(
+        "a node on the deny list is revoked before it is given away",
+        "Policy.require_whitelisted",
+        "self.denied(uuid, entry.fingerprint if entry is not None else None)",
+        "self.denied(uuid, entry.fingerprint if entry is not None else None) if returning else None",
+        "tests/station/test_policy.py",
+    ),
+    Pattern(
         "of the bundles for a distrusted key the open ones are named",
         "plan_removal",
         "row.state == OPEN and digits in row.peers",

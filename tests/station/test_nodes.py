@@ -118,7 +118,12 @@ def test_a_renamed_node_leaves_its_old_name_although_the_whitelist_keeps_it(stat
         station.nodes.resolve("grip")
     assert station.nodes.bearers_of(["grip", "wrist"]) == {"wrist": FINGER}
     assert station.nodes.all_named("grip") == []
-    assert station.nodes.beginning_with("", 9) == [(FINGER.hex(), "wrist"), ("wrist", FINGER.hex())]
+    assert (station.nodes.named("grip"), station.nodes.named("wrist")) == (None, FINGER)
+    station.nodes.restore(NodeRecord(JOINT, name="grip"))
+    assert station.nodes.named("grip") == JOINT
+    station.nodes.restore(NodeRecord(JOINT, name="elbow"))
+    assert station.nodes.beginning_with("wr", 9) == [("wrist", FINGER.hex())]
+    assert station.nodes.beginning_with("gr", 9) == []
 
 
 def test_a_name_that_two_nodes_have_is_ambiguous(station: Station) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import NotWhitelistedError, PolicyError, UsageError
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import (
     Handover,
@@ -137,6 +139,31 @@ def test_decisions_that_another_program_wrote_do_not_count(
         f"Another program added the lifting of ban {digest[:16]}, the end of trust in CA {fingerprint(WEST)[:16]},"
         " which does not count."
     ]
+
+
+def test_for_a_key_that_the_roster_names_the_roster_alone_decides(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = station.policy
+    until = datetime(2026, 12, 1, tzinfo=UTC)
+    here, south = (
+        Member(name, point, b"", frozenset({"base"})) for name, point in (("me", station.point), ("b", SOUTH))
+    )
+    gone = RemovedMember("gone", WEST, frozenset({"base"}), "lost", (0, ""))
+    for record in (
+        trusted("c", NORTH), trusted("w", WEST), trusted("s", SOUTH), trusted("a-ca", WEST, "ca"),
+        trusted("z", station.ca),
+    ):  # fmt: skip
+        policy.restore_trust(record)
+    assert not policy.in_roster(fingerprint(SOUTH))
+    roster = Roster("r", "plant", 1, "", datetime(2026, 3, 1, 12, tzinfo=UTC), until, (here, south), (gone,))
+    monkeypatch.setattr(type(station.plant), "roster", property(lambda plant: roster))
+    assert names(policy.listed()) == [("a-ca", "ca"), ("b", "station"), ("c", "station"), ("z", "station")]
+    (member,) = (record for record in policy.listed() if record.name == "b")
+    assert member == TrustRecord("b", "station", SOUTH, fingerprint(SOUTH), "2026-03-01T12:00:00Z")
+    assert [policy.in_roster(fingerprint(point)) for point in (SOUTH, WEST, NORTH)] == [True, True, False]
+    assert policy.trusted_stations() == [station.point, NORTH, station.ca]
+    assert len(policy.trust_rows()) == 5
 
 
 # -- refused nodes -----------------------------------------------------------------------------------------------------
