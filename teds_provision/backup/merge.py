@@ -9,7 +9,7 @@ from dataclasses import replace
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.snapshot import Relation, extend_audit
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import RevocationRecord, Tombstone, WhitelistEntry
+from teds_provision.station.store.records import KeyRecord, RevocationRecord, Tombstone, WhitelistEntry
 
 
 class Merge:
@@ -21,11 +21,12 @@ class Merge:
         self.older = how in (Relation.OLDER, Relation.SAME)
         self.back: Counter[str] = Counter()
         self.kept: Counter[str] = Counter()
-        epochs = {record.uuid: record.epoch for record in live.nodes.all()}
+        self.known = {record.uuid: record.epoch for record in live.nodes.all()}
+        newest: dict[bytes, int] = {}
         for key in live.keys.all():
-            epochs[key.uuid] = max(epochs.get(key.uuid, 0), key.epoch)
-        self.epochs = epochs
-        self.held = {key.uuid for key in live.keys.all()}
+            newest[key.uuid] = max(newest.get(key.uuid, 0), key.epoch)
+        self.newest = newest
+        self.held = frozenset(newest)
         self.barred = {gone.uuid for gone in live.policy.revocations()} | {
             gone.uuid for gone in live.policy.tombstones()
         }
@@ -132,10 +133,9 @@ class Merge:
         for record in self.copy.keys.all():
             if any(key.key_id == record.key_id for key in self.live.keys.keys_of(record.uuid)):
                 continue
-            newest = self.epochs.get(record.uuid)
             if record.uuid in self.barred:
                 self.kept["keys of revoked or moved nodes left out"] += 1
-            elif newest is None or record.epoch > newest:
+            elif self._lacks(record):
                 # If this store already holds a key of the node, add this one as pending; the next Open shows which key
                 # is in use.
                 self.live.keys.add(
@@ -144,6 +144,17 @@ class Merge:
                 self.back["keys"] += 1
             else:
                 self.kept["older keys left out"] += 1
+
+    def _lacks(self, record: KeyRecord) -> bool:
+        """Return True if a key is newer than those that this store holds, and than what it knows of the node.
+
+        A store that was rebuilt knows an epoch from its pages whose key it does not hold: then that key is lacking. One
+        that holds no key of a node that it knows gave it up.
+        """
+        newest, known = self.newest.get(record.uuid), self.known.get(record.uuid)
+        if newest is None:
+            return known is None or record.epoch > known
+        return record.epoch > newest and (known is None or record.epoch >= known)
 
     def _images(self) -> None:
         for record in self.copy.nodes.all():

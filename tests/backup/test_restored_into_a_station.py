@@ -234,6 +234,32 @@ def test_states_that_went_different_ways_keep_both_sides_newest(station: Station
     other.close()
 
 
+def test_a_key_of_an_epoch_that_only_the_stations_own_pages_told_comes_back(station: Station, tmp_path: Path) -> None:
+    """A home that was rebuilt knew that epoch and held the old key: the key that opens the node was left out."""
+    stale = tmp_path / "stale"
+    with copy_of(station, tmp_path) as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
+    add_key(station, ONE, 2)
+    station.nodes.remember(ONE, epoch=2)
+    station.audit("agree", ONE, "done")
+    back_up(station, tmp_path / "b")
+    with closing(Station.open(stale, ask=ask)) as rebuilt:
+        rebuilt.nodes.remember(ONE, epoch=2)
+        rebuilt.audit("registry", None, "adopted")
+        done = merge(rebuilt, opened(tmp_path / "b"), dry_run=False)
+        assert done.relation is Relation.DIVERGED
+        assert done.back["keys"] == 1
+        assert {epoch for epoch, _, _ in keys_of(rebuilt, ONE)} == {1, 2}
+        rebuilt.nodes.remember(ONE, epoch=3)
+        for key in rebuilt.keys.keys_of(ONE):
+            if key.epoch == 2:
+                rebuilt.keys.remove_key(ONE, key.key_id)
+        done = merge(rebuilt, opened(tmp_path / "b"), dry_run=False)
+        assert {epoch for epoch, _, _ in keys_of(rebuilt, ONE)} == {1}, "the node has a newer one by now"
+
+
 def test_the_backup_of_another_station_is_refused(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
     other = make_station(tmp_path / "other")
