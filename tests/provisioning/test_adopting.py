@@ -254,6 +254,11 @@ def test_what_is_judged_of_a_datasheet_that_was_brought_in_whole_words(station: 
     warned = read_factory_datasheet(station, Image(UUID, bare))
     assert warned.errors == ()
     assert "Channel 1 has no calibration: raw values cannot be turned into °." in warned.warnings
+    hand = read_factory_datasheet(station, Image(UUID, dict(load_profile("gripper").build(UUID).blocks)))
+    raw = [channel.number for channel in hand.channels if channel.value_problem]
+    sensors = [channel.number for channel in hand.channels if channel.value_problem and not channel.actuator]
+    assert raw != sensors, "an actuator without a calibration takes raw numbers, which is no fault"
+    assert [text.split()[1] for text in hand.warnings if "has no calibration" in text] == [str(n) for n in sensors]
     renamed = read_factory_datasheet(station, Image(UUID, named(factory(), 0, "x" * 121)), name="mine")
     assert renamed.name == "mine", "the name that is replaced is not judged"
     full = read_factory_datasheet(station, Image(UUID, named(factory(), 1, "ä" * 60)))

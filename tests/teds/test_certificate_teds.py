@@ -102,6 +102,7 @@ def lines_teds(head: str, text: bytes, *more: bytes) -> bytes:
         (lines_teds("030400830101", b"a=1\nb=2\n", raw_tuple(5, b"")), "does not have the form of the profile"),
         (lines_teds("030400830101", b"a=1\nb=2"), "are not a, b, in this order"),
         (lines_teds("030400830101", b"a=1\nb=2\n\n"), "are not a, b, in this order"),
+        (lines_teds("030400830101", b"a=1\nb=2\nx"), "are not a, b, in this order"),
         (lines_teds("030400830101", b"b=2\na=1\n"), "are not a, b, in this order"),
         (lines_teds("030400830101", b"a=1\n"), "are not a, b, in this order"),
         (lines_teds("030400830101", b"a=1\nb\n"), "are not a, b, in this order"),

@@ -7,6 +7,7 @@ import struct
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -407,3 +408,77 @@ def test_a_table_of_4000_points_is_judged_in_a_blink(magnetic: Profile) -> None:
     check_calibration(blocks, blocks, magnetic)
     with costs_at_most(1.0):
         assert check_calibration(blocks, blocks, magnetic) == []
+
+
+def said(
+    new: Blocks, old: Blocks | None = None, profile: Profile | None = None, **more: Any
+) -> list[tuple[str, str, str]]:
+    found = check_calibration(new, old, profile, **more)
+    assert {finding.channel for finding in found} <= {1}
+    return [(finding.severity, finding.code, finding.message) for finding in found]
+
+
+def test_each_finding_in_whole_words(tactile: Profile) -> None:
+    good, bare = built(tactile, force_line()), tactile.build(UUID).blocks
+    falling = built(tactile, force_line(10.0, -10 / 65535))
+    falls = "the result falls by 10 N from raw 0 to raw 65535"
+    assert said(built(tactile, force_line(5.0, 0.0)), None, tactile) == [
+        ("error", "flat", "every reading becomes 5 N: the gain is zero")
+    ]
+    assert said(falling, good) == [("error", "reversed", f"{falls}; with what the node has now it rose by 10 N")]
+    assert said(falling, None, tactile) == [("error", "reversed", f"{falls}; its type says that it must be increasing")]
+    assert said(built(tactile, force_line(-1.0)), None, tactile) == [
+        ("error", "limits", "raw 0 gives -1 N, 1 N below the low limit of 0 N; the stated uncertainty is 0.2 N")
+    ]
+    assert said(built(tactile, force_line(uncertainty=0.5)), None, tactile) == [
+        ("error", "residual", "the calibration is good to 0.5 N only; the stated uncertainty is 0.2 N")
+    ]
+    assert said(built(tactile, force_line(uncertainty=0.2)), None, tactile) == []
+    assert said(built(tactile, force_line(0.0, 8 / 65535)), good, tactile) == [
+        (
+            "warning",
+            "changed",
+            "against what the node has now it differs by up to 2 N (20 % of the range), at raw 65535",
+        )
+    ]
+    assert said(built(tactile, force_line(0.0, 9.05 / 65535)), good, tactile) == [], "a tenth of the range"
+    assert said(bare, good, tactile) == [("warning", "removed", "the calibration that the node has is taken away")]
+    zeros = replace(force_line(), coefficients=(0.0, 0.0))
+    assert said(built(tactile, zeros), None, tactile) == [
+        ("error", "erased", "all coefficients are zero: every reading would become the same value")
+    ]
+    late = force_line(date=datetime(2020, 1, 1, tzinfo=UTC), interval=86400.0)
+    assert said(built(tactile, late), now=datetime(2026, 1, 1, tzinfo=UTC)) == [
+        ("warning", "overdue", "the calibration of 2020-01-01 was due again on 2020-01-02, 2191 days ago")
+    ]
+    assert said(built(tactile, late)) == []
+
+
+def test_a_table_that_jumps_says_where_and_errors_come_first(tactile: Profile) -> None:
+    table = replace(fit([(0, 0.0), (30000, 4.5), (65535, 10.0)], "table", channel=1), unit=parse_unit("N"))
+    first, *others = table.coefficients
+    jumping = built(tactile, replace(table, coefficients=(first + 0.3, *others)))
+    fall = "the result falls by 0.29985 N from raw 29999 to 30000"
+    jump = ("error", "jump", "the table jumps by 0.3 N at 30000, between its segments 1 and 2")
+    assert said(jumping, None, tactile) == [
+        ("error", "not-monotone", f"{fall}; its type says that it must be increasing"),
+        jump,
+    ]
+    assert said(jumping, built(tactile, table)) == [
+        ("error", "not-monotone", f"{fall}; what the node has now is monotone"),
+        jump,
+    ]
+    assert said(jumping) == [jump, ("warning", "not-monotone", f"{fall}; nothing here says whether it may")]
+
+
+def test_an_exchange_of_gain_and_offset_is_named_as_such_alone() -> None:
+    profile = load_profile("load-cell", [shipped_profiles()])
+    part = CalibrationInput(1, 1, (4_194_304, 12_582_912), (8_388_608,))
+    right = Calibration(1, "linear", (part,), (0.3, 500 / 4_194_304), unit=parse_unit("N"))
+    found = said(built(profile, replace(right, coefficients=right.coefficients[::-1])), built(profile, right))
+    assert found[0] == ("error", "swapped", "gain and offset are exchanged against what the node has now")
+    assert {code for _, code, _ in found} == {"swapped", "limits"}
+    covers = (
+        "(the calibration covers raw 4194304 to 12582912; say raw-range in the profile if the channel gives no others)"
+    )
+    assert all(message.endswith(covers) for _, code, message in found if code == "limits")
