@@ -258,7 +258,8 @@ def moment(text: str, now: datetime | None = None) -> str:
     ago = re.fullmatch(r"(\d{1,6})\s*([smhdw])", word)
     try:
         if word in ("today", "yesterday"):
-            found = at.replace(hour=0, minute=0, second=0, microsecond=0) - timedelta(days=word == "yesterday")
+            day = at.date() - timedelta(days=word == "yesterday")
+            found = datetime(day.year, day.month, day.day)  # local: its offset may be another one than now
         elif ago is not None:
             found = at - timedelta(**{_UNITS[ago[2]]: int(ago[1])})
         else:
