@@ -50,6 +50,7 @@ class Merge:
         self._facts()
         self._marks()
         self._groups()
+        self._line()
 
     def kept_sentences(self) -> list[str]:
         """Return sentences about what stayed."""
@@ -224,6 +225,47 @@ class Merge:
         }
         self.live.keys.put_flags(wanted)
         self.back["marks"] += len(wanted)
+
+    def _line(self) -> None:
+        """Merge jobs, units, evidence and requests to an office: a station removes none of them, so none is too old."""
+        live, copy = self.live.plant.line, self.copy.plant.line
+        for job in copy.jobs():
+            known, (_, over) = live.job(job.id), copy.state_of(job.id)
+            if known is None:
+                live.add_job(job)
+            elif self.newer and known.hash == job.hash and known.state != job.state:
+                live.set_job_state(job.id, job.state)
+            self.back["jobs"] += known is None
+            if over and not live.state_of(job.id)[1]:
+                live.put_end_seen(job.id)
+            self._units(job.id)
+        present = live.evidence_digests()
+        for document in copy.evidence():
+            if document.sha256 not in present:
+                live.add_evidence(document)
+                self.back["evidence"] += 1
+        for request in copy.all_sign_requests():
+            kept = live.sign_request(request.hash, request.direction)
+            if kept is None or (kept.answer is None and request.answer is not None):
+                live.put_sign_request(request)
+                self.back["sign requests"] += 1
+
+    def _units(self, job: str) -> None:
+        """Merge a job's units: the most attempts count; one whose number another board has here gets the next one."""
+        live = self.live.plant.line
+        known = {unit.uuid: unit for unit in live.units(job)}
+        numbers = {unit.unit for unit in known.values()}
+        for unit in self.copy.plant.line.units(job):
+            here = known.get(unit.uuid)
+            if here is None:
+                wanted = replace(unit, unit=max(numbers) + 1) if unit.unit in numbers else unit
+                numbers.add(wanted.unit)
+            else:
+                passed = here.passed or unit.passed
+                wanted = replace(here, attempts=max(here.attempts, unit.attempts), passed=passed)
+            if wanted != here:
+                live.put_unit(wanted)
+                self.back["units"] += 1
 
 
 def _more(live: Iterable[RevocationRecord | Tombstone], copy: Iterable[RevocationRecord | Tombstone]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import sqlite3
 from contextlib import closing
@@ -14,6 +15,7 @@ from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import complete_vault, merge, open_present, rebuild
 from teds_provision.errors import PolicyError, UsageError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.plant.line import EvidenceRow, JobRow, SignRequestRow, UnitRow
 from teds_provision.station.snapshot import Relation, place
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.records import (
@@ -258,6 +260,47 @@ def test_a_key_of_an_epoch_that_only_the_stations_own_pages_told_comes_back(stat
                 rebuilt.keys.remove_key(ONE, key.key_id)
         done = merge(rebuilt, opened(tmp_path / "b"), dry_run=False)
         assert {epoch for epoch, _, _ in keys_of(rebuilt, ONE)} == {1}, "the node has a newer one by now"
+
+
+def test_a_lines_jobs_units_and_evidence_that_are_missing_come_back(station: Station, tmp_path: Path) -> None:
+    """Evidence that only a newer backup held was lost: nothing of a line was merged, and nobody was told."""
+
+    def evidence(uuid: bytes, document: bytes) -> EvidenceRow:
+        digest = hashlib.sha256(document).hexdigest()
+        return EvidenceRow(digest, uuid, "job", 1, 1, "passed", "2026-11-28T10:00:00Z", document)
+
+    line, stale = station.plant.line, tmp_path / "stale"
+    line.add_job(JobRow("job", "0" * 64, b"octets"))
+    line.put_unit(UnitRow("job", ONE, 1, "2026-11-28T10:00:00Z"))
+    line.put_sign_request(SignRequestRow("1" * 64, "out", "job", ONE, "peer", b"request"))
+    with copy_of(station, tmp_path) as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
+    line.put_unit(UnitRow("job", ONE, 1, "2026-11-28T10:00:00Z", 3, 2))
+    line.put_unit(UnitRow("job", TWO, 2, "2026-11-28T11:00:00Z"))
+    line.add_job(JobRow("later", "2" * 64, b"octets"))
+    line.put_end_seen("job")
+    line.add_evidence(evidence(ONE, b"one"))
+    line.put_sign_request(SignRequestRow("1" * 64, "out", "job", ONE, "peer", b"request", b"answer", 4))
+    station.audit("unit", ONE, "taken")
+    back_up(station, tmp_path / "b")
+    with closing(Station.open(stale, ask=ask)) as rebuilt:
+        rebuilt.plant.line.put_unit(UnitRow("job", NEW, 2, "2026-11-28T12:00:00Z"))
+        rebuilt.plant.line.add_evidence(evidence(NEW, b"new"))
+        rebuilt.audit("unit", NEW, "taken")
+        plan = merge(rebuilt, opened(tmp_path / "b"), dry_run=True)
+        assert list(rebuilt.plant.line.evidence(uuid=ONE)) == []
+        done = merge(rebuilt, opened(tmp_path / "b"), dry_run=False)
+        assert done == plan
+        assert done.back == {"jobs": 1, "units": 2, "evidence": 1, "sign requests": 1}
+        held = [(unit.uuid, unit.unit, unit.attempts, unit.passed) for unit in rebuilt.plant.line.units("job")]
+        assert held == [(ONE, 1, 3, 2), (NEW, 2, 1, 0), (TWO, 3, 1, 0)]
+        assert {row.document for row in rebuilt.plant.line.evidence()} == {b"one", b"new"}
+        request = rebuilt.plant.line.sign_request("1" * 64, "out")
+        assert request is not None
+        assert (request.answer, rebuilt.plant.line.state_of("job")) == (b"answer", ("open", True))
+        assert merge(rebuilt, opened(tmp_path / "b"), dry_run=False).back == {}
 
 
 def test_the_backup_of_another_station_is_refused(station: Station, tmp_path: Path) -> None:

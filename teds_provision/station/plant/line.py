@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from teds_provision.station.store.database import CHUNK, places
 from teds_provision.station.store.records import utc_now
@@ -69,6 +69,8 @@ class SignRequestRow:
 _UNIT = ", ".join(column.name for column in fields(UnitRow))
 _EVIDENCE = ", ".join(column.name for column in fields(EvidenceRow))
 _REQUEST = ", ".join(column.name for column in fields(SignRequestRow))
+_REQUESTS_AT_ONCE: Final = 16
+"""Each has an image and a calibration: up to 1 MiB."""
 
 
 class Line:
@@ -171,6 +173,10 @@ class Line:
                 return
             after = (rows[-1].uuid, rows[-1].attempt, rows[-1].sha256)
 
+    def evidence_digests(self) -> set[str]:
+        """Return the SHA-256 of every document that is kept."""
+        return {str(row[0]) for row in self._store.execute("SELECT sha256 FROM evidence")}
+
     # -- requests to an office -------------------------------------------------------------------------------------
 
     def sign_request(self, hash: str, direction: Literal["out", "in"]) -> SignRequestRow | None:
@@ -187,6 +193,17 @@ class Line:
             " ORDER BY coalesce(sequence, 0), hash",
             (job, uuid, direction),
         )
+
+    def all_sign_requests(self) -> Iterator[SignRequestRow]:
+        """Give every request, asked and answered, some at a time."""
+        after = ""
+        while rows := self._store.read(
+            SignRequestRow,
+            f"SELECT {_REQUEST} FROM sign_requests WHERE hash > ? ORDER BY hash LIMIT {_REQUESTS_AT_ONCE}",
+            (after,),
+        ):
+            yield from rows
+            after = rows[-1].hash
 
     def put_sign_request(self, row: SignRequestRow) -> None:
         """Keep a request, or its answer."""
