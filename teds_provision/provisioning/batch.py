@@ -305,7 +305,11 @@ class BatchRun:
         results = [board.result for board in self._boards]
         steps = [{step.name: step.seconds for step in board.done.steps} for board in self._boards if board.done]
         passed, seconds = results.count("passed"), round(time.monotonic() - self._began, 3)
-        share = round(passed / len(results), 4) if results else None
+        firsts: dict[bytes, bool] = {}  # of each board its first try; a "no" of the operator is none
+        for board in self._boards:
+            if board.result != "skipped":
+                firsts.setdefault(board.uuid, board.result == "passed")
+        share = round(sum(firsts.values()) / len(firsts), 4) if firsts else None
         skipped = results.count("skipped")
         return BatchTotals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
 

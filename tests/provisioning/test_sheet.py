@@ -517,3 +517,44 @@ def test_a_board_that_was_declined_in_the_end_counts_as_none_that_was_tried(stat
     assert isinstance(totals.error, PolicyError), "the worst of all boards, not the last one's"
     assert totals.worst is not None
     assert totals.worst.message == "refused"
+
+
+def test_the_first_pass_yield_of_a_run_without_a_sheet_counts_the_first_try_of_each_board(station: Station) -> None:
+    """A "no" counted as a try, and a board that was held there again as two boards."""
+    run = BatchRun(station, LinkSettings("can"), ProvisionRequest(watch=True), SilentReporter())
+    assert run.totals().first_pass is None
+    run._note(BoardResult(board_of(1), 1.0, error=DeclinedError("no")))
+    assert (run.totals().first_pass, run.totals().skipped) == (None, 1)
+    for number, error in ((1, None), (2, PolicyError("refused")), (2, None), (3, None)):
+        run._note(BoardResult(board_of(number), 1.0, error=error))
+    totals = run.totals()
+    assert (totals.first_pass, totals.passed, totals.failed, totals.skipped) == (0.6667, 3, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("request_", "links", "message"),
+    [
+        (
+            ProvisionRequest(node="x", watch=True),
+            LinkSettings(),
+            "A single node cannot be combined with --all, --watch or",
+        ),
+        (ProvisionRequest(node="x", whole_bus=True), LinkSettings(), "A single node cannot be combined with --all"),
+        (ProvisionRequest(node="x", sheet=Path("s")), LinkSettings(), "A single node cannot be combined with --all"),
+        (
+            ProvisionRequest(whole_bus=True, watch=True),
+            LinkSettings(),
+            "--all provisions the nodes that are on the bus now",
+        ),
+        (ProvisionRequest(report=Path("r.csv")), LinkSettings(), "--report requires a sheet."),
+        (ProvisionRequest(whole_bus=True), LinkSettings("can", can=("a", "b")), "Several readers require --watch."),
+        (ProvisionRequest(), LinkSettings(nfc=("a", "b")), "Several readers require --watch."),
+    ],
+)
+def test_options_that_exclude_each_other_are_refused_before_anything(
+    station: Station, request_: ProvisionRequest, links: LinkSettings, message: str
+) -> None:
+    with pytest.raises(UsageError) as refused:
+        BatchRun(station, links, request_, SilentReporter())
+    assert refused.value.message.startswith(message)
+    BatchRun(station, LinkSettings(nfc=("a", "b")), ProvisionRequest(watch=True), SilentReporter())
