@@ -50,6 +50,7 @@ class Merge:
         self._facts()
         self._marks()
         self._groups()
+        self._names()
         self._line()
 
     def kept_sentences(self) -> list[str]:
@@ -225,6 +226,34 @@ class Merge:
         }
         self.live.keys.put_flags(wanted)
         self.back["marks"] += len(wanted)
+
+    def _names(self) -> None:
+        """Merge chosen names of topics and frames: add those that are missing here, take those of a newer copy.
+
+        Rows of an older copy that this store lacks were reset since. Nothing changes below a running measurement.
+        """
+        if self.older:
+            return
+        live, copy = self.live.measurements, self.copy.measurements
+        present, frames = live.names, live.frames
+        taken = set(present.values())
+        for (uuid, channel), name in copy.names.items():
+            if name == present.get((uuid, channel)) or ((uuid, channel) in present and not self.newer):
+                continue
+            if name in taken or live.is_running(uuid):
+                self.kept["chosen names in use here"] += 1
+                continue
+            live.rename(uuid, channel, name)
+            taken.add(name)
+            self.back["names"] += 1
+        for (uuid, channel), frame in copy.frames.items():
+            if frame == frames.get((uuid, channel)) or ((uuid, channel) in frames and not self.newer):
+                continue
+            if live.is_running(uuid):
+                self.kept["frames of measured nodes"] += 1
+                continue
+            live.set_frame(uuid, channel, frame)
+            self.back["frames"] += 1
 
     def _line(self) -> None:
         """Merge jobs, units, evidence and requests to an office: a station removes none of them, so none is too old."""

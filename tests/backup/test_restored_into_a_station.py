@@ -262,6 +262,31 @@ def test_a_key_of_an_epoch_that_only_the_stations_own_pages_told_comes_back(stat
         assert {epoch for epoch, _, _ in keys_of(rebuilt, ONE)} == {1}, "the node has a newer one by now"
 
 
+def test_chosen_names_and_frames_come_back_from_a_backup_that_is_not_older(station: Station, tmp_path: Path) -> None:
+    """Topics had their default names again after a restore, and whoever read them heard nothing."""
+    stale, here = tmp_path / "stale", station.measurements
+    here.rename(ONE, 0, "wrist")
+    with copy_of(station, tmp_path) as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+        here.rename(ONE, 0, None)
+        station.audit("rename", ONE, "done")
+        assert merge(station, content, dry_run=False).relation is Relation.OLDER
+        assert here.names == {}
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
+    here.rename(TWO, 0, "elbow")
+    here.rename(TWO, 1, "wrist")
+    here.set_frame(ONE, 0, "tool0")
+    station.audit("rename", TWO, "done")
+    back_up(station, tmp_path / "b")
+    with closing(Station.open(stale, ask=ask)) as behind:
+        done = merge(behind, opened(tmp_path / "b"), dry_run=False)
+        assert (done.relation, done.back["names"], done.back["frames"]) == (Relation.NEWER, 1, 1)
+        assert "chosen names in use here: 1" in done.kept
+        assert behind.measurements.names == {(ONE, 0): "wrist", (TWO, 0): "elbow"}
+        assert behind.measurements.frames == {(ONE, 0): "tool0"}
+
+
 def test_a_lines_jobs_units_and_evidence_that_are_missing_come_back(station: Station, tmp_path: Path) -> None:
     """Evidence that only a newer backup held was lost: nothing of a line was merged, and nobody was told."""
 
