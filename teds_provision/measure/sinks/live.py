@@ -228,7 +228,10 @@ class TopicSink(ThreadedSink):
         joints = self._joints.copy()
         for uuid in changed:
             for joint in self._joints_of.pop(uuid, ()):
-                del joints[bisect_left(joints, joint.name, key=_name_of)]
+                place = bisect_left(joints, joint.name, key=_name_of)
+                while joints[place] != joint:  # another node's joint may have the same name
+                    place += 1
+                del joints[place]
         for uuid in changed:
             self._joints_of[uuid] = found[uuid]
             for joint in found[uuid]:
@@ -364,13 +367,18 @@ class TopicSink(ThreadedSink):
             self._went(0)
 
     def _joint_command(self, names: Sequence[str], *values: Sequence[float]) -> None:
-        """Set points of joints came: positions, velocities, efforts; from any thread. Unknown names are refused."""
+        """Set points of joints came: positions, velocities, efforts; from any thread.
+
+        Names of no joint, or of two, are refused.
+        """
         given = dict(zip(INTERFACES, values, strict=True))
-        joints = {joint.name: joint for joint in self._joints}
+        joints: dict[str, Joint | None] = {}
+        for joint in self._joints:  # a name that two joints have means neither: the wrong one would move
+            joints[joint.name] = None if joint.name in joints else joint
         for place, name in enumerate(names):
-            joint = joints.get(name)
-            if joint is not None and place < len(given[joint.command]):
-                self._command(joint.uuid, joint.actuator, float(given[joint.command][place]))
+            meant = joints.get(name)
+            if meant is not None and place < len(given[meant.command]):
+                self._command(meant.uuid, meant.actuator, float(given[meant.command][place]))
             else:
                 self.refused_commands += 1
 

@@ -28,7 +28,7 @@ from teds_provision.measure.blocks import (
 )
 from teds_provision.measure.sinks import names
 from teds_provision.measure.sinks.base import LIVE_WAITING
-from teds_provision.measure.sinks.joints import joints_of
+from teds_provision.measure.sinks.joints import joints_of, state_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning, compounds_of, is_range, meaning_of, variance_of
@@ -607,3 +607,87 @@ def test_of_many_reasons_the_three_most_frequent_are_named() -> None:
     assert why_invalid(found) == "9 of channel 2: why 2; 5 of channel 4: why 4; 3 of channel 5: why 5; 3 more"
     assert why_invalid(found[:3]) == "9 of channel 2: why 2; 2 of channel 1: why 1; 1 of channel 3: why 3"
     assert why_invalid([]) == ""
+
+
+def test_a_name_that_two_joints_have_moves_neither_and_each_goes_with_its_own_node() -> None:
+    """A node that is called as another one's joint: the set point would have moved whichever joined last."""
+    other = "f" * 20
+    two = [*gripper(), replace(gripper()[0], number=4, name="turn", units=parse_units("rad"))]
+    namesake = [replace(facts, uuid=other, node="hand_turn") for facts in gripper()[:1]]
+    came: list[SetPointCommand] = []
+    sink = Carrier(came)
+    sink._prepare((*two, *namesake), STATION)
+    assert [(joint.name, joint.uuid) for joint in sink._joints] == [
+        ("hand_opening_set_point", HAND), ("hand_turn", HAND), ("hand_turn", other),
+    ]  # fmt: skip
+    sink._joint_command(["hand_turn", "hand_opening_set_point"], [0.1, 0.02], [], [])
+    assert ([(command.uuid, command.channel) for command in came], sink.refused_commands) == ([(HAND, 1)], 1)
+    sink._process_item(tuple(replace(facts, chosen=((0, "claw"),)) for facts in namesake))
+    assert [(joint.name, joint.uuid) for joint in sink._joints] == [
+        ("claw", other), ("hand_opening_set_point", HAND), ("hand_turn", HAND),
+    ]  # fmt: skip
+    sink._joint_command(["hand_turn", "claw"], [0.1, 0.2], [], [])
+    assert [(command.uuid, command.channel) for command in came[1:]] == [(HAND, 4), (other, 1)]
+
+
+def test_messages_of_several_channels_are_held_whole() -> None:
+    """What is not measured has -1 as its first covariance, what is not known 0 (sensor_msgs)."""
+    known = [replace(facts, deviation=0.5) for facts in axes("m/s^2", 1)]
+    [imu] = compounds_of(known)
+    assert imu.fields({1: 1.0, 2: 2.0, 3: 3.0, 9: 9.0}) == {
+        "orientation_covariance": [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        "orientation.w": 1.0,
+        "angular_velocity_covariance": [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        "linear_acceleration_covariance": [0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.25],
+        "linear_acceleration.x": 1.0,
+        "linear_acceleration.y": 2.0,
+        "linear_acceleration.z": 3.0,
+    }
+    blind = [replace(facts, uncertainty=None) for facts in axes("rad/s", 4)]
+    [both] = compounds_of([*known, *blind])
+    fields = both.fields(dict(zip(range(1, 7), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), strict=True)))
+    assert fields is not None
+    assert (fields["angular_velocity.z"], fields["angular_velocity_covariance"]) == (6.0, [0.0] * 9)
+    [magnetic] = compounds_of(axes("T", 7))
+    diagonal = pytest.approx([0.03, 0.0, 0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 0.03])
+    assert magnetic.fields({7: 1.0, 8: 2.0, 9: 3.0}) == {
+        "magnetic_field_covariance": diagonal,
+        "magnetic_field.x": 1.0,
+        "magnetic_field.y": 2.0,
+        "magnetic_field.z": 3.0,
+    }
+    [wrench] = compounds_of([*axes("N", 1), *axes("N m", 4)])
+    assert wrench.parts == (
+        ("wrench.force.x", 1), ("wrench.force.y", 2), ("wrench.force.z", 3),
+        ("wrench.torque.x", 4), ("wrench.torque.y", 5), ("wrench.torque.z", 6),
+    )  # fmt: skip
+    finder = ChannelFacts(ARM, "arm", 1, "Range-Finder", units=parse_units("m"), deviation=0.1)
+    [far] = compounds_of([finder])
+    assert far.fields({1: 2.0}) == {
+        "radiation_type": 1, "min_range": 0.0, "max_range": float("inf"), "variance": pytest.approx(0.01), "range": 2.0,
+    }  # fmt: skip
+    [near] = compounds_of([replace(finder, low=0.2, high=4.0)])
+    assert (near.fixed["min_range"], near.fixed["max_range"]) == (0.2, 4.0)
+
+
+def test_the_state_of_joints_is_what_their_sensors_or_else_their_set_points_say() -> None:
+    topics = Topics(STATION)
+    pair = [
+        replace(facts, number=facts.number + shift, name=f"{facts.name} {shift}")
+        for shift in (0, 10)
+        for facts in gripper()
+    ]
+    topics.learn(pair)
+    first, second = joints_of(pair, topics)
+    assert [(joint.name, joint.actuator, dict(joint.state)) for joint in (first, second)] == [
+        ("hand_opening_set_point_0", 1, {"position": 2, "effort": 3}),
+        ("hand_opening_set_point_10", 11, {"position": 12, "effort": 13}),
+    ]
+    newest = {(HAND, 1): 0.09, (HAND, 2): 0.05, (HAND, 3): 4.0, (HAND, 12): 0.06}
+    assert state_of([first, second], newest) == ([first.name, second.name], [0.05, 0.06], [], [])
+    assert state_of([first], newest) == ([first.name], [0.05], [], [4.0])
+    bare = replace(first, state={})
+    assert state_of([bare], newest) == ([first.name], [0.09], [], []), "what was applied"
+    assert state_of([replace(first, command="effort", state={"effort": 3})], newest) == ([], [], [], [])
+    marked = [replace(facts, unverified=True) for facts in gripper()]
+    assert joints_of(marked, topics) == [], "no set point moves what is not signed"
