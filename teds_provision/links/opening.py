@@ -40,7 +40,7 @@ LINKS: Final = {
             "teds_provision.links.can.port",
             CAN,
             "can:socketcan:can0",
-            needs="--via can requires --can, e.g. --can socketcan:can0?bitrate=500000.",
+            needs="--via can requires --can. For example --can socketcan:can0?bitrate=500000.",
             spec="teds_provision.links.can.spec",
         ),
         LinkKind("ble", "teds_provision.links.ble.port", BLE, "ble:hci0", spec="teds_provision.links.ble.spec"),

@@ -310,12 +310,13 @@ def test_the_wait_for_the_next_board_is_over_after_its_time_but_not_while_one_is
 ) -> None:
     clock = SimpleNamespace(now=50.0)
     monkeypatch.setattr(meeting, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    never = IdleStop(10.0)
     stop = IdleStop(10.0)
     clock.now += 9.9
-    assert not stop.is_set()
+    assert (never.is_set(), stop.is_set()) == (False, False)
     stop.renew()
     clock.now += 9.9
-    assert not stop.is_set()
+    assert (never.is_set(), stop.is_set()) == (True, False)
     with stop.working(), stop.working():
         clock.now += 500.0
         assert not stop.is_set()

@@ -1,0 +1,118 @@
+"""The option --ble, and what errors of bleak and BlueZ mean for a person."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from teds_provision.errors import NodeSilentError, NoReaderError, UsageError
+from teds_provision.links.ble import ble_errors
+from teds_provision.links.ble.spec import BleSpec, parse_spec
+
+
+@pytest.mark.parametrize(
+    ("text", "adapter", "address"),
+    [
+        ("", None, None),
+        ("auto", None, None),
+        ("hci0", "hci0", None),
+        ("?address=c1-d8-57-00-01-01", None, "C1:D8:57:00:01:01"),
+        ("hci1?address=C1:D8:57:00:01:01", "hci1", "C1:D8:57:00:01:01"),
+    ],
+)
+def test_the_option_names_an_adapter_and_perhaps_a_node(text: str, adapter: str | None, address: str | None) -> None:
+    spec = parse_spec(text)
+    assert spec == BleSpec(adapter, address)
+    assert spec.text == (adapter or "the Bluetooth adapter")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("hci0?x=1", "--ble knows no option 'x'."),
+        ("hci0?address=C1:D8", "'C1:D8' is not a Bluetooth address."),
+        ("hci0?address=", "'' is not a Bluetooth address."),
+        ("hci 0", "'hci 0' is not a Bluetooth adapter name."),
+        ("x" * 33, f"'{'x' * 33}' is not a Bluetooth adapter name."),
+    ],
+)
+def test_a_wrong_option_is_named(text: str, message: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        parse_spec(text)
+    assert refused.value.message == message
+    assert refused.value.hint == "Use --ble auto, --ble hci0 or --ble 'hci0?address=C1:D8:57:00:01:01'."
+
+
+class BlueZError(Exception):
+    def __init__(self, text: str = "", *, name: str = "", reason: str = "") -> None:
+        super().__init__(text)
+        self.dbus_error = name
+        self.reason = SimpleNamespace(name=reason)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (FileNotFoundError(), "There is no D-Bus system bus, so Bluetooth is unavailable."),
+        (ConnectionRefusedError(), "There is no D-Bus system bus, so Bluetooth is unavailable."),
+        (PermissionError(), "There is no D-Bus system bus, so Bluetooth is unavailable."),
+        (
+            BlueZError(name="org.freedesktop.DBus.Error.ServiceUnknown"),
+            "The Bluetooth service (bluetoothd) is not running.",
+        ),
+        (
+            BlueZError(name="org.freedesktop.DBus.Error.NameHasNoOwner"),
+            "The Bluetooth service (bluetoothd) is not running.",
+        ),
+        (BlueZError(reason="POWERED_OFF"), "Bluetooth is switched off on hci0."),
+        (BlueZError("br-connection-adapter-not-powered"), "Bluetooth is switched off on hci0."),
+        (BlueZError(reason="NO_BLE_CENTRAL_ROLE"), "The LE central role is not supported by hci0."),
+        (BlueZError(reason="NO_BLUETOOTH"), "There is no Bluetooth adapter."),
+        (BlueZError("adapter 'hci7' not found"), "There is no Bluetooth adapter hci0."),
+        (BlueZError("org.bluez.AccessDenied"), "This user may not use Bluetooth."),
+    ],
+)
+def test_why_bluetooth_cannot_be_used(error: Exception, message: str) -> None:
+    found = ble_errors.adapter_trouble(error, "hci0")
+    assert isinstance(found, NoReaderError)
+    assert found.message == message
+    assert found.hint
+
+
+def test_what_is_the_air_and_no_trouble_of_the_machine() -> None:
+    busy = ("org.bluez.Error.InProgress", "org.bluez.Error.NotReady")
+    gone = ("org.freedesktop.DBus.Error.UnknownObject", "org.freedesktop.DBus.Error.UnknownMethod")
+    for name in (*busy, *gone, "org.bluez.Error.Failed"):
+        error = BlueZError("le-connection-abort-by-local", name=name)
+        assert ble_errors.adapter_trouble(error, "hci0") is None
+        assert ble_errors.is_busy(error) is (name in busy)
+        assert ble_errors.is_gone(error) is (name in gone)
+    assert ble_errors.is_gone(Exception("Device C1 was not found."))
+
+
+@pytest.mark.parametrize(
+    ("text", "held", "full"),
+    [
+        ("le-connection-concurrent-connection-limit", 0, True),
+        ("le-connection-refused", 0, False),
+        ("le-connection-refused", 1, True),
+        ("le-connection-busy", 2, True),
+        ("le-connection-memory-allocation", 1, True),
+        ("le-connection-abort-by-local", 9, False),
+    ],
+)
+def test_an_adapter_is_full_by_its_word_or_if_it_holds_connections_and_takes_no_more(
+    text: str, held: int, full: bool
+) -> None:
+    assert ble_errors.is_full(Exception(text), range(held)) is full
+
+
+def test_the_words_of_a_full_adapter_and_of_a_silent_node() -> None:
+    assert ble_errors.too_many(1, "hci0").message == "The Bluetooth of hci0 holds 1 connection and takes no more."
+    assert ble_errors.too_many(2, "hci0").message == "The Bluetooth of hci0 holds 2 connections and takes no more."
+    silent = "The node at C1 does not answer over BLE"
+    assert ble_errors.silent("C1", None).message == f"{silent}."
+    assert ble_errors.silent("C1", Exception("the connection ended. ")).message == f"{silent} (the connection ended)."
+    assert ble_errors.silent("C1", TimeoutError()).message == f"{silent} (TimeoutError)."
+    assert ble_errors.silent("C1", NodeSilentError("It is gone.")).message == f"{silent} (It is gone)."
