@@ -5,6 +5,91 @@ from __future__ import annotations
 from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
+    # clocks that were wrong for a while, places that changed, backups that are merged
+    Pattern(
+        "a request of a clock that was ahead is made anew",
+        "_earlier",
+        "row.answer is None and request.created > latest",
+        "False",
+        "tests/plant/test_office.py",
+    ),
+    Pattern(
+        "a request to join of a clock that was ahead is made anew",
+        "request",
+        "earlier.created <= made.created + MOST_AHEAD and replace(earlier, created=made.created) == made",
+        "replace(earlier, created=made.created) == made",
+        "tests/plant/test_sync_files.py",
+    ),
+    Pattern(
+        "a slow clock dates no roster anew",
+        "require_wrong_date",
+        "member is not None and digits != station.fingerprint and created > latest",
+        "False",
+        "tests/plant/test_sync_files.py",
+    ),
+    Pattern(
+        "a stale file of an export is not called done",
+        "_already",
+        "digest in notes.stale",
+        "False",
+        "tests/handover/test_exporting.py",
+    ),
+    Pattern(
+        "a bundle that a clock dated ahead is stale",
+        "BundleNotes.why_stale",
+        "self.created and datetime.fromisoformat(self.created) > now + CLOCK_TOLERANCE",
+        "False",
+        "tests/handover/test_exporting.py",
+    ),
+    Pattern(
+        "a copy that a clock dated ahead is made anew",
+        "_is_over",
+        "ahead or row.expires <= time_text(now)",
+        "row.expires <= time_text(now)",
+        "tests/plant/test_parcels.py",
+    ),
+    Pattern(
+        "exported evidence keeps its file whatever its number is now",
+        "export",
+        "next((path for path in same if holds(path, row.document)), None)",
+        "None",
+        "tests/plant/test_evidence.py",
+    ),
+    Pattern(
+        "a transfer folder that is gone is not made again",
+        "FolderTransport._make",
+        "self._require()",
+        "None",
+        "tests/plant/test_sync_files.py",
+    ),
+    Pattern(
+        "the service lets go of the registry's former place",
+        "PlantWatch._follow",
+        "place == self._place",
+        "True",
+        "tests/plant/test_service.py",
+    ),
+    Pattern(
+        "another place of a registry has acknowledged nothing",
+        "Plant.join",
+        "0 if moved else record.acknowledged",
+        "record.acknowledged",
+        "tests/plant/test_service.py",
+    ),
+    Pattern(
+        "a key whose epoch was only heard of is lacking",
+        "Merge._lacks",
+        "record.epoch > newest and (known is None or record.epoch >= known)",
+        "record.epoch > newest and (known is None or record.epoch > known)",
+        "tests/backup/test_restored_into_a_station.py",
+    ),
+    Pattern(
+        "a unit that is merged takes no number of another board",
+        "Merge._units",
+        "unit.unit in numbers",
+        "False",
+        "tests/backup/test_restored_into_a_station.py",
+    ),
     Pattern(
         "who measures under our address is known by its own frames",
         "rival_measures",
