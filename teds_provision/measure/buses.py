@@ -74,10 +74,14 @@ class Buses:
         self.close()
 
     def add(self, port: MeasuringLink) -> MeasuredBus:
-        """Hear one more bus."""
-        if port.place not in self._buses:
-            self._buses[port.place] = MeasuredBus(port, self.presence, poll=self._poll)
-        return self._buses[port.place]
+        """Hear one more bus; one that was opened anew is heard in place of its closed port."""
+        known = self._buses.get(port.place)
+        if known is not None and known.port is port:
+            return known
+        if known is not None:
+            known.close()
+        made = self._buses[port.place] = MeasuredBus(port, self.presence, poll=self._poll)
+        return made
 
     def all(self) -> Sequence[MeasuredBus]:
         """Return every bus."""

@@ -2036,6 +2036,20 @@ PATTERNS = (
         "tests/measure/test_matching.py",
     ),
     Pattern(
+        "a bus that was opened anew is heard in place of its closed port",
+        "Buses.add",
+        "known is not None and known.port is port",
+        "known is not None",
+        "tests/ncap/test_watching.py",
+    ),
+    Pattern(
+        "a set point for a name of two joints moves neither",
+        "TopicSink._joint_command",
+        "None if joint.name in joints else joint",
+        "joint",
+        "tests/measure/sinks/test_live.py",
+    ),
+    Pattern(
         "strangers never displace a node that is measured",
         "Presence.add_sighting",
         "MOST + len(self._announced)",

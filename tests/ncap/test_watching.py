@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from teds_provision.errors import LinkError
 from teds_provision.links import Notice
+from teds_provision.measure import buses as buses_module
 from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.buses import Buses
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor
 from teds_provision.ncap.membership import Member, Membership
 from teds_provision.ncap.nodes import link_watch
@@ -361,3 +363,54 @@ def test_of_silent_nodes_five_a_second_are_asked_and_each_once_in_ten(monkeypatc
     assert counts == {0.0: 5, 0.5: 0, 1.0: 5, 2.0: 2, 3.0: 0, 4.0: 0, 10.0: 5}
     assert {address for at, address in asked if at == 1000.0} == {0, 1, 2, 3, 4}, "those that are silent longest"
     assert not {98, 99} & {address for _, address in asked}
+
+
+def test_a_bus_that_is_lost_between_two_looks_is_not_closed_by_its_watch(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its discovery opens it again; a closed one is no bus of any measurement or discovery any more."""
+    states, looks = list[str](), list[str]()
+
+    def lost(_notice: object) -> None:
+        looks.append("lost")
+        if len(looks) == 3:
+            watch._stop.set()
+        raise LinkError("The adapter was pulled.")
+
+    discovery = SimpleNamespace(poll=lambda _seconds: None, failure=None)
+    buses: Any = SimpleNamespace(add=lambda _port: SimpleNamespace(discovery=discovery))
+    monkeypatch.setattr(watch, "_buses", buses)
+    monkeypatch.setattr(watch, "_anew", SimpleNamespace(is_set=lambda: False, wait=lambda _seconds: None))
+    monkeypatch.setattr(watch, "_publish_state", lambda state, _problem=None: states.append(state))
+    port: Any = SimpleNamespace(
+        poll_seconds=30.0, capabilities=SimpleNamespace(connectionless=False), report_rivals=lost
+    )
+    watch._watch_bus(port)
+    assert (looks, states) == (["lost"] * 3, ["up"] * 3)
+
+
+def test_a_bus_that_was_opened_anew_is_heard_in_place_of_its_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All threads of the process kept the closed one: no node of that bus was found until the service was restarted."""
+    course = list[str]()
+
+    class Bus:
+        def __init__(self, port: Any, _presence: object, *, poll: float | None) -> None:
+            self.port = port
+            course.append(f"{port.name} {poll}")
+
+        def close(self) -> None:
+            course.append(f"{self.port.name} closed")
+
+    monkeypatch.setattr(buses_module, "MeasuredBus", Bus)
+    first, again, other = (
+        SimpleNamespace(name=name, place=place) for name, place in (("a", "can:x"), ("b", "can:x"), ("c", "can:y"))
+    )
+    buses = Buses([cast(Any, first)])
+    before = buses.add(cast(Any, first))
+    assert buses.add(cast(Any, other)) is not before
+    made = buses.add(cast(Any, again))
+    assert course == ["a None", "c None", "a closed", "b None"]
+    assert buses.bus_of(cast(Any, SimpleNamespace(port=first))) is made
+    assert {cast(Any, bus.port).name for bus in buses.all()} == {"b", "c"}
+    buses.close()
+    assert course[-2:] == ["b closed", "c closed"]

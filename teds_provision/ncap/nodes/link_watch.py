@@ -232,7 +232,8 @@ class LinkWatch:
             failure = bus.discovery.failure
             self._publish_state("up" if failure is None else "down", failure)
             if failure is None:
-                port.report_rivals(self._notice)
+                with suppress(LinkError):  # the bus was lost just now: its discovery reports it, and opens it again
+                    port.report_rivals(self._notice)
             if asked is not None and failure is None:
                 for uuid, sighting in asked.look(dict(self._known)):
                     if sighting is not None:
