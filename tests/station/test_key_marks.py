@@ -7,11 +7,11 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from teds_provision.errors import NoPassphraseError, StoreChangedError, VaultError
+from teds_provision.errors import NoPassphraseError, StoreChangedError, UnknownMasterKeyError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station import node_keys
 from teds_provision.station.node_keys import deferred, deferred_until
-from teds_provision.station.station import Station
+from teds_provision.station.station import Station, rewrap
 from teds_provision.station.store.records import Holder, KeyFlags, KeyRecord
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
@@ -229,3 +229,43 @@ def test_who_else_holds_keys(station: Station) -> None:
     assert {(holder.uuid, holder.fingerprint) for holder in keys.holders()} == {(A, one), (B, one)}
     keys.rotated(A)
     assert keys.holders() == [rows[2]]
+
+
+# -- a master key that changed meanwhile -------------------------------------------------------------------------------
+
+
+def test_a_record_that_was_read_before_the_master_key_changed_is_read_again(station: Station) -> None:
+    agreed(station, A, 1, 2)
+    records = station.keys.keys_of(A)
+    with station.lock("test"):
+        rewrap(station)
+    assert [station.keys.unwrap(record) for record in records] == [b"\2" * 16, b"\1" * 16]
+    assert station.keys.unwrap_named({A: id_of(1)}) == {A: (1, b"\1" * 16)}
+
+
+def test_a_key_under_a_master_key_that_never_was_is_damaged(station: Station, store: Store) -> None:
+    agreed(station, A, 1)
+    store.execute("UPDATE keys SET wrapped = CAST(x'0100000009' || substr(wrapped, 6) AS BLOB)")
+    (record,) = station.keys.keys_of(A)
+    with pytest.raises(UnknownMasterKeyError):
+        station.keys.unwrap(record)
+
+
+def test_a_new_key_is_wrapped_under_the_master_key_of_now(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    agreed(station, A, 1)
+    reread: list[str] = []
+    monkeypatch.setattr(station.keys, "_reopened", lambda: reread.append("vault"))
+    station.keys.refresh()
+    assert reread == []
+    monkeypatch.setattr(type(station.identity), "master", property(lambda identity: 7))
+    agreed(station, A, 2)
+    assert reread == ["vault"]
+
+
+def test_of_nine_pending_keys_the_oldest_goes_and_the_active_one_stays(station: Station) -> None:
+    agreed(station, A, 1)
+    station.keys.activate(A, id_of(1))
+    agreed(station, A, *range(2, 10))
+    assert [key.epoch for key in station.keys.keys_of(A)] == [9, 8, 7, 6, 5, 4, 3, 2, 1]
+    agreed(station, A, 10)
+    assert [key.epoch for key in station.keys.keys_of(A)] == [10, 9, 8, 7, 6, 5, 4, 3, 1]

@@ -179,7 +179,7 @@ class OperationRole:
         demand(FIRST_LEASE <= asked.lease <= LAST_LEASE, Reason.OUT_OF_RANGE)
         if asked.dead_man is not None:
             demand(FIRST_DEAD_MAN <= asked.dead_man <= LAST_DEAD_MAN, Reason.OUT_OF_RANGE)
-        # An actuator has one claim: refuse with 13 if it is this session's, with 17 if it is another one's.
+        # An actuator has one claim: refuse with 2 if it is this session's, with 17 if it is another one's.
         held = self.claims.actuators.get(number)
         if held is not None:
             raise CommandRefusedError(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
