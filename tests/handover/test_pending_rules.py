@@ -16,11 +16,14 @@ from teds_provision.handover.pending import (
     ListedHandover,
     close,
     content_digest,
+    digest_of,
     find_handover,
     list_handovers,
+    peer_name,
     signer_of,
     undo,
 )
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station
@@ -280,3 +283,16 @@ def test_bundles_are_listed_with_names_and_whether_they_can_still_be_taken(stati
         ListedHandover(came, ("west",), 1, "2026-03-08T08:00:00Z", False),
     ]
     assert [listed.expired for listed in list_handovers(station, ends)] == [True, False]
+
+
+def test_a_bundle_has_the_digest_of_its_nodes_in_ascending_order() -> None:
+    one = BundledNode(A, SOUTH.point, b"k" * 16, 3)
+    two = BundledNode(B, WEST.point, b"l" * 16, 4)
+    now = datetime(2026, 3, 1, tzinfo=UTC)
+    bundle = Bundle(ID, "s", (TO_WEST, TO_SOUTH), now, now, "move", b"\x04", (two, one), {})
+    due = content_digest("s", (TO_SOUTH, TO_WEST), "move", b"\x04", [(A, one.kid, 3), (B, two.kid, 4)])
+    assert digest_of(bundle) == digest_of(replace(bundle, nodes=(one, two))) == due
+
+
+def test_a_station_is_called_by_its_name_here_else_by_16_digits(station: Station, told: Events) -> None:
+    assert [peer_name(station, digits) for digits in (TO_WEST, TO_SOUTH, "ab" * 32)] == ["west", "south", "ab" * 8]
