@@ -1,0 +1,259 @@
+"""What comes back of a copy, row by row, if it is older, newer, or went another way (when-something-went-wrong.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.backup.merge import Merge
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.snapshot import Relation
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import (
+    Draft,
+    Group,
+    Handover,
+    Holder,
+    KeyFlags,
+    KeyRecord,
+    NodeRecord,
+    RevocationRecord,
+    Tombstone,
+    TrustRecord,
+    WhitelistEntry,
+)
+from teds_provision.teds.image import Image
+from tests.backup.test_backup_rows import Octets
+from tests.bench import copied_station
+
+A, B = bytes.fromhex("8d4d9da65281f7000001"), bytes.fromhex("8d4d9da65281f7000002")
+POINT, POINT2 = SoftwareKey(121).point, SoftwareKey(122).point
+KEY, KEY2 = fingerprint(POINT), fingerprint(POINT2)
+AT, LATER = "2026-10-01T08:00:00Z", "2026-10-02T08:00:00Z"
+OLDER, SAME, NEWER, OTHER = Relation.OLDER, Relation.SAME, Relation.NEWER, Relation.DIVERGED
+
+
+class Two:
+    """A store, and a copy of it from before anything was done to either."""
+
+    def __init__(self, live: Station) -> None:
+        self.live, self.copy = live, Station.of_backup(Octets(b"".join(live.rows())))
+
+    def merged(self, how: Relation) -> Merge:
+        done = Merge(self.live, self.copy, how)
+        done.run()
+        done.back = +done.back
+        done.kept = +done.kept
+        return done
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Iterator[Two]:
+    with copied_station(tmp_path / "home") as live:
+        made = Two(live)
+        yield made
+        made.copy.close()
+
+
+def key(uuid: bytes, epoch: int, state: str = "active", slot: int = 1) -> KeyRecord:
+    return KeyRecord(uuid, epoch, f"{epoch:016x}", state, slot, b"wrapped", "agreement", AT)  # type: ignore[arg-type]
+
+
+Put = Callable[[Station], object]
+HANDOVER = Handover("h1", "out", "move", (KEY,), "open", "{}", created=AT)
+
+
+@pytest.mark.parametrize(
+    ("what", "put", "comes_back_from"),
+    [
+        ("revocations", lambda s: s.policy.deny(RevocationRecord(A, None, "lost", "s", AT)), {OLDER, NEWER, OTHER}),
+        ("handovers", lambda s: s.handovers.put(HANDOVER), {OLDER, NEWER, OTHER}),
+        ("tombstones", lambda s: s.policy.put_tombstone(Tombstone(A, KEY, "h", AT)), {NEWER, OTHER}),
+        ("holders", lambda s: s.keys.put_holder(Holder(A, KEY, AT)), {NEWER, OTHER}),
+        ("nodes", lambda s: s.nodes.restore(NodeRecord(A, POINT, epoch=3)), {OLDER, NEWER, OTHER}),
+        ("groups", lambda s: s.groups.put(Group("hand", (A,), AT)), {NEWER, OTHER}),
+        ("whitelist", lambda s: s.pins.restore([WhitelistEntry(A, KEY, AT)]), {OLDER, NEWER, OTHER}),
+        ("keys", lambda s: s.keys.add(key(A, 3)), {OLDER, NEWER, OTHER}),
+        ("trust in ca north", lambda s: s.policy.restore_trust(TrustRecord("north", "ca", POINT, KEY, AT)),
+         {OLDER, NEWER, OTHER}),
+        ("CAs whose trust has ended", lambda s: s.policy.restore_ended_ca(KEY, b"m" * 16), {NEWER, OTHER}),
+        ("bans lifted", lambda s: s.policy.restore_lifted(KEY, b"m" * 16), {NEWER}),
+        ("certificates", lambda s: s.identity.put_certificate(KEY, KEY2, bytes(64)), {OLDER, NEWER, OTHER}),
+        ("marks", lambda s: s.keys.put_flags({A: KeyFlags(rotation="why")}), {OLDER, NEWER, OTHER}),
+    ],
+)  # fmt: skip
+def test_what_the_copy_alone_has(two: Two, what: str, put: Put, comes_back_from: set[Relation]) -> None:
+    put(two.copy)
+    whole = b"".join(two.live.rows())
+    for how in (OLDER, SAME, NEWER, OTHER):
+        with Station.of_backup(Octets(whole)) as live:
+            done = Merge(live, two.copy, how)
+            done.run()
+            comes = (OLDER if how is SAME else how) in comes_back_from
+            assert dict(+done.back) == ({what: 1} if comes else {}), how
+            assert dict(+done.kept) == {}
+            assert (b"".join(live.rows()) != whole) is comes
+
+
+NODE = NodeRecord(A, POINT, "old", epoch=3, sequence=5)
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "newer", "other", "kept"),
+    [
+        (NODE, replace(NODE, name="new"), replace(NODE, name="new"), NODE, {}),
+        (NODE, replace(NODE, epoch=4), replace(NODE, epoch=4), replace(NODE, epoch=4), {}),
+        (NODE, replace(NODE, sequence=9), replace(NODE, sequence=9), replace(NODE, sequence=9), {}),
+        (NODE, replace(NODE, epoch=2, name="new"), replace(NODE, name="new"), NODE, {"epoch": 1}),
+        (NODE, replace(NODE, sequence=4, epoch=4), replace(NODE, epoch=4), replace(NODE, epoch=4), {"epoch": 1}),
+        (NODE, replace(NODE, point=POINT2, name="new", epoch=4), replace(NODE, epoch=4), replace(NODE, epoch=4),
+         {"pinned": 1}),
+        (replace(NODE, point=None), NODE, NODE, replace(NODE, point=None), {}),
+        (NODE, replace(NODE, point=None, name="new"), replace(NODE, name="new"), NODE, {}),
+        (NODE, NODE, NODE, NODE, {}),
+    ],
+)  # fmt: skip
+def test_a_node_that_both_have(
+    two: Two, here: NodeRecord, there: NodeRecord, newer: NodeRecord, other: NodeRecord, kept: dict[str, int]
+) -> None:
+    two.copy.nodes.restore(there)
+    for how, due in ((OTHER, other), (OLDER, other), (NEWER, newer)):
+        two.live._store.execute("DELETE FROM nodes")
+        two.live.nodes.restore(here)
+        done = two.merged(how)
+        assert two.live.nodes.get(A) == due, how
+        assert done.back["nodes"] == (due != here)
+        words = {"epoch": "nodes whose epoch or sequence is higher now", "pinned": "nodes pinned to another key now"}
+        assert dict(done.kept) == {words[name]: count for name, count in kept.items()}
+
+
+@pytest.mark.parametrize(
+    ("here", "shown", "there", "revoked", "how", "back", "kept"),
+    [
+        (None, None, KEY, False, OLDER, 1, ""),
+        (None, None, KEY, True, NEWER, 0, "revoked nodes off the whitelist"),
+        (KEY, None, KEY, True, NEWER, 0, ""),
+        (KEY2, None, KEY, False, NEWER, 0, "whitelist entries pinned to another key now"),
+        (None, POINT2, KEY, False, OLDER, 0, "whitelist entries pinned to another key now"),
+        (None, POINT, KEY, False, OLDER, 1, ""),
+        (None, POINT2, None, False, OLDER, 1, ""),
+        (KEY2, None, None, False, NEWER, 1, ""),
+        (KEY2, None, None, False, OTHER, 0, ""),
+        (None, None, KEY, False, OTHER, 1, ""),
+    ],
+)
+def test_an_entry_of_the_whitelist(
+    two: Two, here: str | None, shown: bytes | None, there: str | None, revoked: bool, how: Relation, back: int,
+    kept: str,
+) -> None:  # fmt: skip
+    if here is not None:
+        two.live.pins.restore([WhitelistEntry(A, here, AT)])
+    if shown is not None:
+        two.live.nodes.restore(NodeRecord(A, shown))
+    if revoked:
+        two.live.policy.deny(RevocationRecord(A, None, "lost", "s", AT))
+    two.copy.pins.restore([WhitelistEntry(A, there, AT)])
+    done = two.merged(how)
+    expected = {kept: 1} if kept else {}
+    expected |= {"revocations made since": 1} if revoked else {}
+    assert (done.back["whitelist"], dict(done.kept)) == (back, expected)
+
+
+@pytest.mark.parametrize(
+    ("here", "node_epoch", "barred", "there", "found", "kept"),
+    [
+        ([], 0, "", [3], [(3, "active", "agreement")], ""),
+        ([], 4, "", [5], [(5, "active", "agreement")], ""),
+        ([], 5, "", [5], [], "older keys left out"),  # the node was at that epoch: its key was given up since
+        ([3], 0, "", [4], [(4, "pending", "import"), (3, "active", "agreement")], ""),
+        ([3], 0, "", [3], [(3, "active", "agreement")], ""),
+        ([3], 0, "", [2], [(3, "active", "agreement")], "older keys left out"),
+        ([], 0, "revoked", [3], [], "keys of revoked or moved nodes left out"),
+        ([], 0, "moved", [3], [], "keys of revoked or moved nodes left out"),
+    ],
+)
+@pytest.mark.parametrize("how", [OLDER, NEWER, OTHER])
+def test_a_key_comes_back_if_it_is_newer_than_all_that_is_known_here(
+    two: Two, how: Relation, here: list[int], node_epoch: int, barred: str, there: list[int],
+    found: list[tuple[int, str, str]], kept: str,
+) -> None:  # fmt: skip
+    if node_epoch:
+        two.live.nodes.restore(NodeRecord(A, POINT, epoch=node_epoch))
+    for epoch in here:
+        two.live.keys.add(key(A, epoch))
+    for epoch in there:
+        two.copy.keys.add(key(A, epoch, slot=2))
+    if barred == "revoked":
+        two.live.policy.deny(RevocationRecord(A, None, "lost", "s", AT))
+    if barred == "moved":
+        two.live.policy.put_tombstone(Tombstone(A, KEY, "h", AT))
+    done = two.merged(how)
+    assert [(held.epoch, held.state, held.source) for held in two.live.keys.keys_of(A)] == found
+    assert done.kept[kept or "nothing"] == bool(kept)
+
+
+@pytest.mark.parametrize(
+    ("put", "change", "read"),
+    [
+        (lambda s: s.handovers.put(HANDOVER), lambda s: s.handovers.put(replace(HANDOVER, state="closed")),
+         lambda s: s.handovers.all()[0].state == "closed"),
+        (lambda s: s.groups.put(Group("hand", (A,), AT)), lambda s: s.groups.put(Group("hand", (B,), AT)),
+         lambda s: s.groups.get("hand").uuids == (B,)),
+        (lambda s: s.keys.put_flags({A: KeyFlags(rotation="a")}),
+         lambda s: s.keys.put_flags({A: KeyFlags(rotation="b")}),
+         lambda s: s.keys.rotation_due(A) == "b"),
+        (lambda s: s.datasheets.keep_draft(Draft(A, Image(A), created=AT)),
+         lambda s: s.datasheets.keep_draft(Draft(A, Image(A), "signed", created=AT)),
+         lambda s: s.datasheets.draft(A).stage == "signed"),
+        (lambda s: s.pins.restore([WhitelistEntry(A, KEY, AT)]),
+         lambda s: s.pins.restore([WhitelistEntry(A, KEY, AT, "tap")]), lambda s: s.pins.row(A).assurance == "tap"),
+    ],
+)  # fmt: skip
+def test_a_row_that_both_have_is_replaced_by_that_of_a_newer_copy_alone(
+    two: Two, put: Put, change: Put, read: Put
+) -> None:
+    two.copy.nodes.restore(NodeRecord(A))
+    put(two.live)
+    change(two.copy)
+    for how in (OLDER, SAME, OTHER):
+        two.merged(how)
+        assert not read(two.live), how
+    two.merged(NEWER)
+    assert read(two.live)
+
+
+def test_a_flag_of_an_older_copy_comes_with_a_key_that_is_missing_here_alone(two: Two) -> None:
+    two.live.keys.add(key(A, 3))
+    two.copy.keys.put_flags({A: KeyFlags(rotation="settled since"), B: KeyFlags(rotation="why")})
+    assert two.merged(OLDER).back["marks"] == 1
+    assert [two.live.keys.rotation_due(uuid) for uuid in (A, B)] == [None, "why"]
+    two.merged(OTHER)
+    assert two.live.keys.rotation_due(A) == "settled since"
+
+
+def test_a_key_is_trusted_under_the_name_that_it_has_here(two: Two) -> None:
+    two.live.policy.restore_trust(TrustRecord("north", "station", POINT, KEY, AT))
+    two.copy.policy.restore_trust(TrustRecord("nord", "station", POINT, KEY, AT))
+    two.copy.policy.restore_trust(TrustRecord("north", "ca", POINT2, KEY2, AT))
+    two.copy.policy.restore_trust(TrustRecord("west", "ca", POINT, KEY, AT))
+    done = two.merged(NEWER)
+    assert {(record.name, record.role) for record in two.live.policy.trust_rows()} == {
+        ("north", "station"), ("west", "ca")
+    }  # fmt: skip
+    assert dict(done.kept) == {"the name 'north' for the key trusted under it now": 1}
+    assert done.kept_sentences() == ["the name 'north' for the key trusted under it now: 1"]
+
+
+def test_what_happened_since_is_counted(two: Two) -> None:
+    for uuid in (A, B):
+        two.live.policy.deny(RevocationRecord(uuid, None, "lost", "s", AT))
+        two.live.policy.put_tombstone(Tombstone(uuid, KEY, "h", AT))
+    two.copy.policy.deny(RevocationRecord(A, None, "another", "t", LATER))
+    done = two.merged(NEWER)
+    assert dict(done.kept) == {"revocations made since": 1, "nodes moved away since": 2}
+    kept = two.live.policy.revocation(A)
+    assert kept is not None
+    assert kept.why == "lost", "a ban that is here stays as it is"
