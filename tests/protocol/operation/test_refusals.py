@@ -273,6 +273,14 @@ def test_subscribe_in_the_order_of_section_4() -> None:
     )
 
 
+def test_a_stream_that_is_replaced_takes_its_gap_with_it() -> None:
+    bench = Bench().open().operate(1)
+    assert bench.reason(subscribe(n=1, period=1000 * MS, gap=60000)) is None
+    assert bench.reason(subscribe(n=1, period=1 * MS, gap=200)) is None, "2 frames: 400000 ppm of its own gap"
+    assert bench.reason(subscribe(stream=1, n=1, period=1000 * MS, gap=300)) is None, "600000 ppm, and 600 ppm more"
+    assert bench.reason(subscribe(stream=1, n=1, period=1000 * MS, gap=501)) == Reason.DOES_NOT_FIT
+
+
 def test_the_budget_counts_every_stream_of_the_bus_and_the_largest_gap() -> None:
     bench = Bench().open().open("can:f2").operate(1).operate(1, link="can:f2")
     assert bench.reason(subscribe(n=1, period=1 * MS, gap=200)) is None, "2 frames: 400000 ppm"

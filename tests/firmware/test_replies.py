@@ -1,0 +1,77 @@
+"""Stored replies of the node in C, over CAN: how long one is kept, and which one gives way to another station's."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.links.can.isotp import physical_id, single
+from teds_provision.protocol.messages.frames import Function, security_command
+from tests.firmware.memory_node import MemoryNode
+from tests.firmware.test_manage import Firmware
+from tests.protocol.desk import NODE, UUID
+
+pytestmark = pytest.mark.system
+
+PLACES = 3
+"""Two sessions, and one for every other station (firmware/include/teds/config.h)."""
+
+
+class Stations:
+    """Stations that have a board blink, which nobody does twice for one wish."""
+
+    def __init__(self) -> None:
+        self.now, self.firmware = 0.0, Firmware()
+        self.node = MemoryNode(
+            lambda kind, size: NODE.secret() if kind == "i" else b"\x01" * size, lambda: self.now, uuid=UUID
+        )
+        self.node.has_firmware(self.firmware)
+        assert self.node.start() == 0
+        self.node.joins_bus()
+        self.address = self.node.can_address
+        self._take_all()
+
+    def locate(self, number: int, transaction: int = 5, seconds: int = 60) -> bytes:
+        """Ask for it; return what the node sends back."""
+        frame = bytes((transaction,)) + security_command(Function.LOCATE, bytes((seconds,))).encode()
+        self.node.take_frame(physical_id(self.address, number), single(frame), fd=True)
+        return self._take_all()
+
+    def _take_all(self) -> bytes:
+        octets = b""
+        for _ in range(50):
+            self.node.poll()
+            while (sent := self.node.next_frame()) is not None:
+                octets += sent[1] if sent[0] & 0x1FFF0000 == 0x18DA0000 else b""  # it announces itself too
+        return octets
+
+
+@pytest.fixture
+def stations() -> Stations:
+    return Stations()
+
+
+def test_a_reply_is_kept_for_20_seconds(stations: Stations) -> None:
+    reply = stations.locate(0xF1)
+    assert reply
+    stations.now = 19.999
+    assert stations.locate(0xF1) == reply
+    assert stations.firmware.blinks == [60]
+    assert stations.locate(0xF1, transaction=6) != reply
+    assert stations.firmware.blinks == [60, 60], "another transaction is another wish"
+    stations.now = 39.999 + 0.001
+    stations.locate(0xF1, transaction=6)
+    assert stations.firmware.blinks == [60, 60, 60]
+    stations.node.close()
+
+
+def test_the_oldest_reply_gives_way(stations: Stations) -> None:
+    for number in range(PLACES + 1):
+        stations.now = float(number)
+        stations.locate(0xF1 + number)
+    assert len(stations.firmware.blinks) == PLACES + 1
+    for number in range(1, PLACES + 1):
+        stations.locate(0xF1 + number)
+    assert len(stations.firmware.blinks) == PLACES + 1, "those that came later are there"
+    stations.locate(0xF1)
+    assert len(stations.firmware.blinks) == PLACES + 2
+    stations.node.close()
