@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import click
@@ -60,9 +62,7 @@ def set_name(app: App, node: str, channel: int | str, name: str, *, dry_run: boo
         topics = measure.sinks.names.Topics(measure.measurement_job.station_facts(station))
         topics.learn(facts for _, _, facts in _channels(station))
         topics.require_free(uuid.hex(), channel, chosen)
-    if not dry_run:
-        _change(app, station, uuid, channel, chosen)
-    _print_names(app, station)
+    _change(app, station, partial(_rename, station, uuid, channel, chosen), dry_run=dry_run)
 
 
 @command("teds-provision names reset 8d4d 1", name="reset")
@@ -79,9 +79,7 @@ def reset_name(app: App, node: str, channel: int | str, *, dry_run: bool) -> Non
     uuid = _who(station, node)
     if isinstance(channel, str):  # a number may refer to a channel that the datasheet no longer has
         channel = _require_channel(station, uuid, channel)
-    if not dry_run:
-        _change(app, station, uuid, channel, None)
-    _print_names(app, station)
+    _change(app, station, partial(_rename, station, uuid, channel, None), dry_run=dry_run)
 
 
 @command(
@@ -108,11 +106,12 @@ def set_frame(app: App, node: str, channel: int | str, frame: str, *, dry_run: b
             f"{frame!r} is not a valid frame.", hint="Use letters, digits, _ and /, starting with a letter."
         )
     channel = _require_channel(station, uuid, channel)
-    if not dry_run:
-        with station.lock("names", app.note), station.transaction():
-            station.measurements.set_frame(uuid, channel, frame or None)
-            station.audit("frame", uuid, "done", channel=channel, frame=frame)
-    _print_names(app, station)
+
+    def change() -> None:
+        station.measurements.set_frame(uuid, channel, frame or None)
+        station.audit("frame", uuid, "done", channel=channel, frame=frame)
+
+    _change(app, station, change, dry_run=dry_run)
 
 
 def _who(station: Station, node: str) -> bytes:
@@ -133,10 +132,25 @@ def _require_channel(station: Station, uuid: bytes, channel: int | str) -> int:
     raise NotFoundError(f"{uuid.hex()} has no channel {which}.", hint=f"Channels in its datasheet: {has}.")
 
 
-def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | None) -> None:
-    with station.lock("names", app.note), station.transaction():
-        station.measurements.rename(uuid, channel, name)
-        station.audit("rename", None if uuid == STATION else uuid, "done", channel=channel, name=name)
+def _rename(station: Station, uuid: bytes, channel: int, name: str | None) -> None:
+    station.measurements.rename(uuid, channel, name)
+    station.audit("rename", None if uuid == STATION else uuid, "done", channel=channel, name=name)
+
+
+class _PlannedError(Exception):
+    """Rolls a change back that was tried out."""
+
+
+def _change(app: App, station: Station, change: Callable[[], None], *, dry_run: bool) -> None:
+    """Change names or frames and print them all; ``dry_run`` prints them as they would be."""
+    with station.lock("names", app.note), suppress(_PlannedError), station.transaction():
+        change()
+        if dry_run:
+            app.note("Plan, nothing is changed:")
+            _print_names(app, station)
+            raise _PlannedError
+    if not dry_run:
+        _print_names(app, station)
 
 
 def _channels(station: Station) -> list[tuple[bytes, int, measure.blocks.ChannelFacts]]:
