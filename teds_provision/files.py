@@ -173,7 +173,8 @@ def read_limited(
     except (OSError, ValueError) as error:
         raise _unreadable(path, error, failure) from error
     if len(octets) > max_octets:
-        raise BadDataError(f"{path} is larger than {max_octets} octets, which is too large for a {what}.")
+        article = "an" if what[0] in "aeiouAEIOU" else "a"
+        raise BadDataError(f"{path} is larger than {max_octets} octets, which is too large for {article} {what}.")
     return octets
 
 

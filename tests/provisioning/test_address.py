@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from teds_provision.errors import NodeRefusedError, NodeSilentError
+from teds_provision.errors import GarbledError, NodeRefusedError, NodeSilentError, UsageError
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.provisioning.address import set_address
+from teds_provision.provisioning import address
+from teds_provision.provisioning.address import set_address, set_address_at
+from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from tests.bench import Board, MemoryLink, talk
 
@@ -29,6 +34,7 @@ def test_over_the_bus_it_takes_a_session(station: Station, board: Board) -> None
     run(station, board)
     with talk(board, MemoryLink(board, via="can", tapped=False)) as node:
         assert set_address(station, node, 0x22)
+        assert not node.sealed, "the session was one of the old address"
     assert board.state.can_address == 0x22
 
 
@@ -76,3 +82,40 @@ def test_a_node_that_is_not_at_the_new_address_is_silent(station: Station, board
     record = station.nodes.get(board.uuid)
     assert record is not None
     assert record.can_address != 0x22
+
+
+def test_another_node_at_the_new_address_is_not_this_one(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(station, board)
+    stranger = replace(board.tim.identity(), uuid=bytes(10), can_address=0x22)
+    monkeypatch.setattr(OneBus, "identify_at", lambda _link, _address: stranger)
+    with talk(board, OneBus(board, via="can", tapped=False, lose_reply=3)) as node, pytest.raises(NodeSilentError):
+        set_address(station, node, 0x22)
+
+
+def test_a_node_without_can_has_no_address_and_one_that_keeps_the_old_one_is_told(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(station, board)
+    with talk(board) as node:
+        node.identity = replace(node.identity, can_address=0)
+        with pytest.raises(UsageError, match=r"^This node has no CAN, so it has no CAN address\.$"):
+            set_address(station, node, 0x22)
+    old = board.tim.identity()
+    monkeypatch.setattr(address, "read_identity", lambda _node: old)
+    with talk(board) as node, pytest.raises(GarbledError, match="still reports the old one"):
+        set_address(station, node, 0x22)
+    assert not [entry for entry in station.audit_log.entries() if entry.act == "address"]
+    monkeypatch.setattr(address, "read_identity", lambda _node: board.tim.identity())
+    board.seconds += 10.0
+    with talk(board) as node:
+        assert set_address(station, node, 0x23)
+    (line,) = [entry for entry in station.audit_log.entries() if entry.act == "address"]
+    assert (line.uuid, line.outcome, line.detail) == (board.uuid, "done", {"address": 0x23})
+
+
+def test_a_dry_run_meets_no_node(station: Station, board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(address, "at_node", None)
+    report = set_address_at(station, LinkSettings(), board.uuid.hex(), 0x22, SilentReporter(), dry_run=True)
+    assert (report.uuid, report.changed) == (board.uuid, None)

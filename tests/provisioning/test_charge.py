@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from teds_provision.errors import PolicyError
+from teds_provision.errors import BadDataError, NodeRefusedError, PolicyError
 from teds_provision.links.hints import Charging
+from teds_provision.protocol.operation.commands import POWER, PowerReply
 from teds_provision.provisioning.build import BuildOrder
-from teds_provision.provisioning.charge import Low, wait_for_charge
+from teds_provision.provisioning.charge import Low, require_charge, wait_for_charge
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
@@ -48,3 +51,45 @@ def test_with_enough_no_node_is_asked(station: Station, board: Board, percent: i
 def test_what_is_not_written_needs_no_charge(station: Station, board: Board) -> None:
     run(station, board, 50)
     assert run(station, board, 1).verified.verdict == "authentic", "reading and verifying go on"
+
+
+@pytest.mark.parametrize(
+    ("answer", "low"),
+    [
+        (PowerReply(1, 9), [9]),
+        (PowerReply(1, 0), [0]),
+        (PowerReply(1, 10), []),
+        (PowerReply(1), []),
+        (PowerReply(0, 3), []),  # fed
+        (PowerReply(6, 3), []),
+        (PowerReply(3, 9), [9]),
+        (NodeRefusedError("no", reason=5), []),
+        (BadDataError("other octets"), []),
+    ],
+)
+def test_over_the_air_the_session_asks_for_it(answer: PowerReply | Exception, low: list[int]) -> None:
+    asked: list[bytes] = []
+    questions: list[str] = []
+
+    def request(frame: bytes, _why: str) -> bytes:
+        asked.append(frame)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer.encode()
+
+    def node(**more: Any) -> Any:
+        facts = {"charging": None, "tapped": False, "wired": False, "sealed": True, "uuid": bytes(10)}
+        return SimpleNamespace(request_idempotent=request, **{**facts, **more})
+
+    require_charge(node(), questions.append)
+    assert questions == [
+        f"The battery of node {'00' * 10} is at {percent} %: the write may fail halfway and have to be repeated."
+        " Write it?"
+        for percent in low
+    ]
+    assert asked == [POWER]
+    for other in ({"tapped": True}, {"wired": True}, {"sealed": False}, {"charging": Charging("no", 10)}):
+        require_charge(node(**other), questions.append)
+    assert (len(asked), len(questions)) == (1, len(low)), "neither asked nor reported"
+    require_charge(node(charging=Charging("no")), questions.append)
+    assert len(asked) == 2, "a hint without a number is no hint"

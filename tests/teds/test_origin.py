@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import string
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -127,3 +128,29 @@ def test_a_stranger_s_text_is_no_value_table_and_no_error(octets: bytes) -> None
         made = teds.compose(4, (("Text", {"LangCode": "en", "Text": content.decode("latin-1")}),))
         assert all(word.isprintable() for word in read_value_table(teds.decode(made)).values())
     assert read_value_table(None) == {}
+
+
+def test_a_value_table_has_its_bounds_when_it_is_written_and_when_it_is_read() -> None:
+    assert signal_xml("Torque", "", {}) == ""
+    rows = {number: f"state {number}" for number in range(70)}
+    text = signal_xml('a"b', "x" * 201, dict(reversed(rows.items())))
+    assert text.startswith(f"""<Signal name='a"b' comment="{"x" * 200}"><Value raw="0">state 0</Value>""")
+    assert (text.count("<Value"), '<Value raw="63">' in text) == (64, True)
+    assert signal_xml("T", "", {1: "a<b>&c"}) == '<Signal name="T"><Value raw="1">a&lt;b&gt;&amp;c</Value></Signal>'
+
+    def read(*texts: str) -> dict[int, str]:
+        return read_value_table(SimpleNamespace(text=[text.encode() for text in texts]))  # type: ignore[arg-type]
+
+    assert read("a name", signal_xml("T", "", {1: "a<b>&c"})) == {1: "a<b>&c"}
+    assert read('<Signal name="T"></Signal>', signal_xml("T", "", {1: "on"})) == {}, "the first one counts"
+    many = "".join(f'<Value raw="{number}">on</Value>' for number in range(65))
+    assert list(read(f'<Signal name="T">{many}')) == list(range(64))
+    for value, found in (("9" * 19, {int("9" * 19): "on"}), ("9" * 20, {})):
+        assert read(f'<Signal name="T"><Value raw="{value}">on</Value>') == found
+    for word, count in (("x" * 128, 1), ("x" * 129, 0), ("", 0), ("a\x07b", 0), ("a<b", 0)):
+        assert len(read(f'<Signal name="T"><Value raw="1">{word}</Value>')) == count
+    row = '<Value raw="1">on</Value>'
+    begin = '<Signal name="T">'
+    assert read(begin + " " * (16_384 - len(begin) - len(row)) + row) == {1: "on"}
+    assert read(begin + " " * (16_385 - len(begin) - len(row)) + row) == {}
+    assert read("é" + begin + row) == {}

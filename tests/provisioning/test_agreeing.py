@@ -1,0 +1,184 @@
+"""``agree``: how often it begins, whom it asks, and what it says of a node with another station's key."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import GarbledError, NodeSilentError, NotWhitelistedError, PolicyError
+from teds_provision.links import LinkSettings
+from teds_provision.provisioning import agree as agreeing
+from teds_provision.provisioning.agree import (
+    AgreeResult,
+    agree,
+    agree_at,
+    agreed_elsewhere,
+    must_take_over,
+    proof_of_reset,
+    reset_node,
+)
+from teds_provision.provisioning.conversation import SessionLostError
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import WhitelistEntry
+from tests.bench import Board, talk
+
+DONE = AgreeResult(3, "ab" * 8, fresh=True)
+
+
+@pytest.mark.parametrize(("losses", "alive", "begun"), [(4, True, 5), (5, True, 5), (1, False, 1)])
+def test_an_agreement_that_is_lost_begins_five_times_at_a_node_that_answers(
+    station: Station, monkeypatch: pytest.MonkeyPatch, losses: int, alive: bool, begun: int
+) -> None:
+    seen: list[tuple[bool, object]] = []
+    forgotten: list[int] = []
+    node: Any = SimpleNamespace(is_alive=lambda: alive, forget=lambda: forgotten.append(len(seen)))
+
+    def begin(*_args: object, again: bool, word: object, **_more: object) -> AgreeResult:
+        seen.append((again, word))
+        if len(seen) <= losses:
+            raise NodeSilentError("silent") if len(seen) % 2 else GarbledError("garbled")
+        return DONE
+
+    monkeypatch.setattr(agreeing, "_agree", begin)
+    who: Any = None
+    if losses < begun:
+        assert agree(station, node, who) is DONE
+    else:
+        with pytest.raises((NodeSilentError, GarbledError)):
+            agree(station, node, who)
+    assert [again for again, _word in seen] == [False] + [True] * (begun - 1)
+    assert len({id(word) for _again, word in seen}) == 1, "a person's word counts for all of them"
+    assert forgotten == list(range(1, begun))
+
+
+def test_a_take_over_is_asked_for_once(station: Station, board: Board) -> None:
+    asked: list[tuple[str, PolicyError]] = []
+    consent = agreeing._TakeoverConsent(rotate=False, take_over=lambda text, error: asked.append((text, error)))
+    with talk(board) as node:
+        consent.require(station, node)
+        consent.require(station, node)
+        with pytest.raises(PolicyError, match="would lock out the current holder"):
+            agreeing._TakeoverConsent(rotate=False, take_over=None).require(station, node)
+        agreeing._TakeoverConsent(rotate=True, take_over=None).require(station, node)
+    ((text, error),) = asked
+    uuid = board.uuid.hex()
+    assert text == (
+        f"Node {uuid} has a key that this station does not hold. Take the node over and lock out the current holder?"
+    )
+    begin = "Have the key handed over (export-keys there), or take the node over at a tap: "
+    assert error.hint == f"{begin}identify --add, then agree {uuid} --rotate --yes"
+    station.pins.put(WhitelistEntry(board.uuid))
+    assert must_take_over(station, board.uuid).hint == f"{begin}agree {uuid} --rotate --yes"
+
+
+def keyed(station: Station, board: Board) -> None:
+    station.pins.put(WhitelistEntry(board.uuid))
+    with talk(board) as node:
+        agree(station, node, identify(station, node))
+
+
+def test_what_a_plan_says(station: Station, board: Board) -> None:
+    node = board.uuid.hex()
+
+    def plan(*, rotate: bool) -> tuple[str, tuple[str, ...]]:
+        report = agree_at(station, LinkSettings(), node, SilentReporter(), rotate=rotate, dry_run=True)
+        assert (report.uuid, report.agreed) == (board.uuid, None)
+        return report.plan, report.held
+
+    for rotate in (False, True):
+        with pytest.raises(NotWhitelistedError):
+            plan(rotate=rotate)
+    station.pins.put(WhitelistEntry(board.uuid))
+    assert plan(rotate=True) == ("agree on a first key", ())
+    with talk(board) as talking:
+        agree(station, talking, identify(station, talking))
+    assert plan(rotate=False) == ("keep", ("active key of epoch 1",))
+    assert plan(rotate=True) == ("rotate", ("active key of epoch 1",))
+
+
+def test_a_key_from_a_backup_is_asked_about_where_no_tap_proves_it(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyed(station, board)
+    monkeypatch.setattr(type(station.keys), "restored", lambda _keys, _uuid: True)
+    monkeypatch.setattr(type(station.keys), "rotation_due", lambda _keys, _uuid: "of a backup")
+    reached: list[tuple[str, bool, Any]] = []
+
+    def at_node(_station: object, links: LinkSettings, _uuid: bytes, _reporter: object, **more: Any) -> Any:
+        reached.append((links.via, links.via_chosen, more))
+        raise NodeSilentError("nobody")
+
+    monkeypatch.setattr(agreeing, "at_node", at_node)
+    questions: list[str] = []
+    for via, rotate in (("nfc", True), ("can", False), ("can", True)):
+        with pytest.raises(NodeSilentError):
+            agree_at(
+                station,
+                LinkSettings(via, can="a:1"),
+                board.uuid.hex(),
+                SilentReporter(),
+                rotate=rotate,
+                confirm=questions.append,
+            )
+    assert questions == [f"Node {board.uuid.hex()} is of a backup. Is it still this station's?"]
+    assert reached == [(via, True, {"unlock": "always", "writes": "agree"}) for via in ("nfc", "can", "can")]
+
+
+def test_a_node_of_the_epoch_held_here_was_not_keyed_elsewhere(station: Station, board: Board) -> None:
+    keyed(station, board)
+    with talk(board) as node:
+        node.identity = replace(node.identity, epoch=1)
+        assert agreed_elsewhere(station, node) == ""
+        node.identity = replace(node.identity, epoch=2)
+        assert agreed_elsewhere(station, node) == (
+            "it reports key epoch 2, after 1 here: keyed elsewhere by tap or rotated by another holder (unverified);"
+            " which station did so will show once it signs the datasheet"
+        )
+
+
+def test_a_whitelist_entry_is_made_once_and_a_bare_one_replaces_none(station: Station, board: Board) -> None:
+    def added() -> list[dict[str, Any]]:
+        return [entry.detail for entry in station.audit_log.entries() if entry.act == "whitelist"]
+
+    def enlist(entry: WhitelistEntry) -> None:
+        with station.transaction():
+            agreeing._enlist(station, entry)
+
+    bare = WhitelistEntry(board.uuid)
+    whole = replace(bare, fingerprint="ab" * 32, assurance="tap")
+    enlist(bare)
+    enlist(whole)
+    enlist(bare)
+    entry = station.pins.entry(board.uuid)
+    assert entry is not None
+    assert entry.fingerprint == "ab" * 32
+    assert [(facts["fingerprint"], facts["assurance"]) for facts in added()] == [(None, bare.assurance)]
+
+
+def test_a_reset_whose_reply_was_lost_is_proven_afterwards(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyed(station, board)
+    with talk(board) as node:
+        who = identify(station, node)
+        whole = node.request
+
+        def lose(command: Any, why: str) -> bytes:
+            reply = whole(command, why)
+            if why == "the reset":
+                raise SessionLostError(NodeSilentError("lost"))
+            return reply
+
+        monkeypatch.setattr(node, "request", lose)
+        receipt = reset_node(station, node, who)
+    assert not station.keys.held(board.uuid)
+    (line,) = [entry for entry in station.audit_log.entries() if entry.act == "reset"]
+    facts = {"epoch": receipt.epoch, "challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
+    assert (line.outcome, line.detail) == ("done", facts)
+    with talk(board) as node:
+        assert proof_of_reset(node, who.point).proof != receipt.proof, "another challenge"

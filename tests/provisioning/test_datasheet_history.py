@@ -1,0 +1,113 @@
+"""Drafts that are dropped, and a datasheet of before that is written again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NotFoundError, PolicyError
+from teds_provision.links import LinkSettings
+from teds_provision.provisioning import datasheet_history
+from teds_provision.provisioning.build import build
+from teds_provision.provisioning.datasheet_history import drop_draft, history_of, restore_datasheet
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.visit import NodeVisit
+from teds_provision.station.station import Station
+from tests.bench import Board, talk
+
+from .test_provision import ANGLE, run
+
+
+def last(station: Station, act: str) -> tuple[str, dict[str, Any]]:
+    line = [entry for entry in station.audit_log.entries() if entry.act == act][-1]
+    return line.outcome, line.detail
+
+
+def test_a_draft_is_dropped_once_and_is_in_the_log(station: Station, board: Board) -> None:
+    run(station, board)
+    node = board.uuid.hex()
+    assert drop_draft(station, node).draft is None
+    with pytest.raises(IndexError):
+        last(station, "draft")
+    build(station, board.uuid, replace(ANGLE, name="another"))
+    kept = station.datasheets.draft(board.uuid)
+    assert kept is not None
+    assert drop_draft(station, node, dry_run=True).draft == kept
+    assert station.datasheets.draft(board.uuid) == kept, "a dry run drops nothing"
+    assert drop_draft(station, node).draft == kept
+    assert station.datasheets.draft(board.uuid) is None
+    assert last(station, "draft") == ("dropped", {"stage": kept.stage, "profile": kept.profile})
+
+
+@pytest.fixture
+def visits(station: Station, board: Board, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Return how each node was visited; each lies on the reader at once."""
+    run(station, board)
+    run(station, board, order=replace(ANGLE, name="second"))
+    made: list[dict[str, Any]] = []
+
+    @contextmanager
+    def at_node(
+        station: Station, links: LinkSettings, uuid: bytes, _reporter: object, **more: Any
+    ) -> Iterator[NodeVisit]:
+        made.append({"uuid": uuid, "via": links.via, **more})
+        with talk(board) as node:
+            yield NodeVisit(station, node, identify(station, node))
+
+    monkeypatch.setattr(datasheet_history, "at_node", at_node)
+    return made
+
+
+def test_a_datasheet_of_before_is_signed_anew_under_the_next_number(
+    station: Station, board: Board, visits: list[dict[str, Any]]
+) -> None:
+    node = board.uuid.hex()
+    uuid, known = history_of(station, node)
+    assert (uuid, [record.sequence for record in known]) == (board.uuid, [2, 1])
+    plan = restore_datasheet(station, LinkSettings(), node, 1, SilentReporter(), dry_run=True)
+    assert (plan.uuid, plan.sequence, plan.written, visits) == (board.uuid, 1, None, [])
+    assert len(plan.changes) == 1
+    build(station, board.uuid, replace(ANGLE, name="third"))
+    with station.transaction():
+        station.nodes.remember(board.uuid, profile="another-type")
+    done = restore_datasheet(station, LinkSettings(nfc="usb", ble="hci0"), node, 1, SilentReporter())
+    assert visits == [{"uuid": board.uuid, "via": "ble", "unlock": "always", "writes": "write"}]
+    assert (done.uuid, done.sequence, done.changes) == (board.uuid, 3, plan.changes)
+    assert done.written is not None
+    assert board.state.sequence == 3
+    now = station.datasheets.datasheet(board.uuid)
+    assert now is not None
+    assert now.unsigned_blocks() == known[1].image.unsigned_blocks()
+    assert station.datasheets.draft(board.uuid) is None, "what was signed last took the place of the draft"
+    assert last(station, "write")[1]["sequence"] == 3
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert (record.profile, known[1].profile) == (ANGLE.profile, ANGLE.profile)
+    assert history_of(station, node)[1][0].profile == known[1].profile
+
+
+def test_what_the_node_has_already_costs_no_number(
+    station: Station, board: Board, visits: list[dict[str, Any]]
+) -> None:
+    done = restore_datasheet(station, LinkSettings(), board.uuid.hex(), 2, SilentReporter())
+    assert (done.sequence, done.changes, board.state.sequence) == (2, (), 2)
+
+
+def test_what_is_refused_before_any_node_is_waited_for(
+    station: Station, board: Board, visits: list[dict[str, Any]]
+) -> None:
+    node = board.uuid.hex()
+    with pytest.raises(NotFoundError) as unknown:
+        restore_datasheet(station, LinkSettings(), node, 7, SilentReporter())
+    assert unknown.value.message == f"Node {node} never had a datasheet with sequence 7."
+    assert unknown.value.hint == "Known are: 2, 1."
+    with station.transaction():
+        station.pins.remove(board.uuid)
+    with pytest.raises(PolicyError):
+        restore_datasheet(station, LinkSettings(), node, 1, SilentReporter(), dry_run=True)
+    assert visits == []
