@@ -291,12 +291,15 @@ class PlantWatch:
 
     def _listen(self) -> None:
         """Start a sync when the registry notifies of a change."""
+        listened: str | None = None  # the place that the listener leads to
         while not self._stop.is_set():
             try:
                 place = plant.connecting.place_of(self._station)
-                if self._listener is not None:
+                if self._listener is not None and place != listened:
                     self._listener.close()
-                self._listener = plant.connecting.listener(self._station)
+                    self._listener = None
+                if self._listener is None:
+                    self._listener, listened = plant.connecting.listener(self._station), place
                 if self._listener is None:  # a folder, which may become a database
                     self._stop.wait(EVERY)
                     continue
