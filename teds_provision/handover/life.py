@@ -175,8 +175,8 @@ def take_over(station: Station, plan: TakeoverPlan, receipt: ResetReceipt | None
     with station.transaction():
         moved = station.measurements.hand_on(old.uuid, new)
         if not plan.done:
+            entry, former = station.pins.entry(new), station.pins.entry(old.uuid)  # which retire() takes away
             retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")  # before the spare takes its name
-            entry, former = station.pins.entry(new), station.pins.entry(old.uuid)
             if entry is not None and former is not None and former.name is not None:
                 station.pins.put(replace(entry, name=former.name))
             station.datasheets.drop_draft(new)

@@ -177,6 +177,16 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
     assert plan_takeover(pair.north, pair.board.uuid, spare.uuid, copy_calibration=False).done
 
 
+def test_a_spare_takes_over_a_name_that_only_the_whitelist_has(pair: Pair) -> None:
+    old, spare, north = pair.board.uuid, bytes.fromhex("8d4d9da65281f700ffff"), pair.north
+    north.nodes.remember(old, name=None)
+    north.pins.put(WhitelistEntry(old, north.pins.pinned(old), name="left thumb"), WhitelistEntry(spare))
+    assert north.nodes.resolve("left thumb") == old
+    take_over(north, plan_takeover(north, old, spare, copy_calibration=False), None)
+    assert north.nodes.resolve("left thumb") == spare
+    assert north.pins.entry(old) is None
+
+
 def calibrated(pair: Pair, tmp_path: Path) -> Board:
     from teds_provision.provisioning.build import BuildOrder
     from teds_provision.provisioning.progress import SilentReporter
