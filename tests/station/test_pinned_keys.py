@@ -205,3 +205,20 @@ def test_the_link_keys_of_an_unpinned_board_stay_with_the_one_that_had_the_pin(
     pins.settled(A)
     assert not pins.is_unsettled(A)
     assert pins.epoch_to_exceed(A, other) == 4
+
+
+def test_a_shown_key_that_another_program_changed_pins_nothing(station: Station, store: Store) -> None:
+    station.unlock()
+    pins = station.pins
+    station.nodes.put(NodeRecord(A, POINT))
+    station.nodes.put(NodeRecord(B))
+    pins.put(entry(B), entry(C, WHOLE2))
+    assert pins.all() == {A: WHOLE, C: WHOLE2}
+    assert pins.all([]) == {C: WHOLE2}, "of the nodes that were read already"
+    assert [pins.pinned(uuid) for uuid in (A, B, C)] == [WHOLE, None, WHOLE2]
+    assert pins.pinned_elsewhere(station.nodes.all()) == set()
+    store.execute("UPDATE nodes SET point = ? WHERE uuid = ?", (POINT2, A))
+    nodes = station.nodes.all()
+    for read in (lambda: pins.pinned(A), pins.all, lambda: pins.pinned_elsewhere(nodes), lambda: pins.check(A, POINT2)):
+        with pytest.raises(StoreChangedError, match=f"the key of node {A.hex()}"):
+            read()
