@@ -244,6 +244,9 @@ def test_a_key_is_trusted_under_the_name_that_it_has_here(two: Two) -> None:
         ("north", "station"), ("west", "ca")
     }  # fmt: skip
     assert dict(done.kept) == {"the name 'north' for the key trusted under it now": 1}
+    again = Merge(two.live, two.copy, OTHER)
+    again.kept["nothing of this"] = 0
+    assert again.kept_sentences() == []
     assert done.kept_sentences() == ["the name 'north' for the key trusted under it now: 1"]
 
 
@@ -252,8 +255,16 @@ def test_what_happened_since_is_counted(two: Two) -> None:
         two.live.policy.deny(RevocationRecord(uuid, None, "lost", "s", AT))
         two.live.policy.put_tombstone(Tombstone(uuid, KEY, "h", AT))
     two.copy.policy.deny(RevocationRecord(A, None, "another", "t", LATER))
+    two.copy.policy.put_tombstone(Tombstone(A, KEY2, "another", LATER))
+    for store, since in ((two.live, AT), (two.copy, LATER)):
+        store.keys.put_holder(Holder(A, KEY, since))
     done = two.merged(NEWER)
-    assert dict(done.kept) == {"revocations made since": 1, "nodes moved away since": 2}
+    assert [row.since for row in two.live.keys.holders()] == [AT]
+    tombstone = two.live.policy.tombstone(A)
+    assert tombstone is not None
+    assert tombstone.handover_id == "h"
+    assert {"holders", "tombstones", "revocations"}.isdisjoint(done.back)
+    assert dict(done.kept) == {"revocations made since": 1, "nodes moved away since": 1}
     kept = two.live.policy.revocation(A)
     assert kept is not None
     assert kept.why == "lost", "a ban that is here stays as it is"
