@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
-from teds_provision.handover.outgoing import ExportOrder, ExportPlan, outputs_of, plan_export, plan_exports
+from teds_provision.handover.outgoing import ExportOrder, ExportPlan, Selection, outputs_of, plan_export, plan_exports
 from teds_provision.handover.pending import BundleNotes
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
@@ -141,6 +141,25 @@ def test_if_nothing_is_left_all_means_the_last_move_that_was_cut(north: Station)
     )
     with pytest.raises(NotFoundError):
         plan(north, mode="move", to=("west",))
+    north.policy.forgive(B)
+    north.keys.remove(B)
+    with pytest.raises(PolicyError, match="cannot be sealed again: this station holds no key for it"):
+        plan_exports(north, ExportOrder(("south",), None, "move"), now=NOW)
+
+
+def test_while_others_can_go_a_move_that_was_cut_stays(north: Station) -> None:
+    moved(north, B)
+    found = plan(north, mode="move")
+    assert [node.uuid for node in found.nodes] == [A]
+    assert found.skipped == ((B, f"{AWAY} {TO_SOUTH[:16]}"),)
+
+
+def test_of_named_nodes_those_that_fit_by_uuid(north: Station) -> None:
+    north.keys.demand_rotation(C, "why")
+    order = ExportOrder(("south",), (C, B, A, B))
+    assert [node.uuid for node in Selection(north, order, {TO_SOUTH}).fitting()] == [A, B]
+    north.keys.demand_rotation(A, "why")
+    assert [node.uuid for node in Selection(north, order, {TO_SOUTH}).fitting()] == [B]
 
 
 @pytest.mark.parametrize(
