@@ -156,3 +156,102 @@ def test_a_refused_change_is_logged_once(
     answer = asyncio.run(app._noted(daemon)(Request(scope), error))
     assert answer.status_code >= 400
     assert outcomes == [(bytes.fromhex("ab" * 10), outcome) for outcome in logged]
+
+
+def test_the_metrics_are_held_whole() -> None:
+    """Prometheus refuses a whole scrape for one line that comes twice; counters keep all of their digits."""
+    report = {"uuid": "ab", "state": "running", "samples": 12_345_678, "lost": 1, "late": 2, "bad": 3, "invalid": 4}
+    status: dict[str, Any] = {
+        "version": "1.0",
+        "station": {"name": 'bench "A"\\\n'},
+        "links": [
+            {"place": "can:x", "state": "up", "nodes": 2, "strangers": 1},
+            {"place": "nfc:y", "state": "down", "nodes": 0, "strangers": 0},
+        ],
+        "measurements": [
+            {"id": "1", "nodes": [report | {"clock_error": 0.00125}, {"uuid": "cd", "state": "lost"}]},
+            {"id": "2", "nodes": [report | {"clock_error": None, "samples": 5}]},
+        ],
+        "sinks": [
+            {"name": "run.csv", "measurement": "1", "written": 9, "dropped": 8, "state": "failed"},
+            {"name": "run.csv", "measurement": "1", "written": 7, "dropped": 0, "state": "running"},
+        ],
+        "budget": {"used": 12.5},
+        "clients": 3,
+    }
+    part: Any = SimpleNamespace(
+        metric_help={"teds_plant_stations": ("gauge", "Stations of the plant.")},
+        metrics=lambda: [("teds_plant_stations", {}, 2)],
+    )
+    node, gone, other = (
+        f'{{node="{uuid}",measurement="{number}"}}' for uuid, number in (("ab", 1), ("cd", 1), ("ab", 2))
+    )
+    sink = '{sink="run.csv",measurement="1"}'
+    assert metrics.text(status, [part]).splitlines() == [
+        "# HELP teds_info Version and name of the station.",
+        "# TYPE teds_info gauge",
+        'teds_info{version="1.0",station="bench \\"A\\"\\\\\\n"} 1',
+        "# HELP teds_link_up 1 where a link works.",
+        "# TYPE teds_link_up gauge",
+        'teds_link_up{link="can:x"} 1',
+        'teds_link_up{link="nfc:y"} 0',
+        "# HELP teds_nodes_present Nodes that are there, by link.",
+        "# TYPE teds_nodes_present gauge",
+        'teds_nodes_present{link="can:x"} 2',
+        'teds_nodes_present{link="nfc:y"} 0',
+        "# HELP teds_strangers Nodes that are not taken up, by link.",
+        "# TYPE teds_strangers gauge",
+        'teds_strangers{link="can:x"} 1',
+        'teds_strangers{link="nfc:y"} 0',
+        "# HELP teds_node_measuring 1 where values of a node come.",
+        "# TYPE teds_node_measuring gauge",
+        f"teds_node_measuring{node} 1",
+        f"teds_node_measuring{gone} 0",
+        f"teds_node_measuring{other} 1",
+        "# HELP teds_samples_total Values of a node in this measurement.",
+        "# TYPE teds_samples_total counter",
+        f"teds_samples_total{node} 12345678",
+        f"teds_samples_total{gone} 0",
+        f"teds_samples_total{other} 5",
+        "# HELP teds_lost_total Messages of a node that were lost.",
+        "# TYPE teds_lost_total counter",
+        f"teds_lost_total{node} 1",
+        f"teds_lost_total{gone} 0",
+        f"teds_lost_total{other} 1",
+        "# HELP teds_late_total Messages of a node that came too late.",
+        "# TYPE teds_late_total counter",
+        f"teds_late_total{node} 2",
+        f"teds_late_total{gone} 0",
+        f"teds_late_total{other} 2",
+        "# HELP teds_bad_total Messages of a node whose tag or form was wrong.",
+        "# TYPE teds_bad_total counter",
+        f"teds_bad_total{node} 3",
+        f"teds_bad_total{gone} 0",
+        f"teds_bad_total{other} 3",
+        "# HELP teds_invalid_total Values of a node that are not valid.",
+        "# TYPE teds_invalid_total counter",
+        f"teds_invalid_total{node} 4",
+        f"teds_invalid_total{gone} 0",
+        f"teds_invalid_total{other} 4",
+        "# HELP teds_clock_error_seconds Bound of the error of a node's times.",
+        "# TYPE teds_clock_error_seconds gauge",
+        f"teds_clock_error_seconds{node} 0.00125",
+        "# HELP teds_sink_written_total Values that a sink wrote.",
+        "# TYPE teds_sink_written_total counter",
+        f"teds_sink_written_total{sink} 9",
+        "# HELP teds_sink_dropped_total Values that a sink dropped.",
+        "# TYPE teds_sink_dropped_total counter",
+        f"teds_sink_dropped_total{sink} 8",
+        "# HELP teds_sink_failed 1 where a sink has ended with an error.",
+        "# TYPE teds_sink_failed gauge",
+        f"teds_sink_failed{sink} 1",
+        "# HELP teds_messages_per_second Messages to ROS and MQTT now.",
+        "# TYPE teds_messages_per_second gauge",
+        "teds_messages_per_second 12.5",
+        "# HELP teds_live_clients Clients of the live channel.",
+        "# TYPE teds_live_clients gauge",
+        "teds_live_clients 3",
+        "# HELP teds_plant_stations Stations of the plant.",
+        "# TYPE teds_plant_stations gauge",
+        "teds_plant_stations 2",
+    ]
