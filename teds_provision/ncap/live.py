@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import math
 import threading
 import time
@@ -25,6 +26,7 @@ from teds_provision.ncap.history import History, raw_numbers
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
 
+_log = logging.getLogger(__name__)
 BEAT: Final = 0.05  # seconds between two messages of values
 POINTS: Final = 100.0  # most points a second and channel
 _CREDIT: Final = 20.0  # points that a channel may save up, since samples come in bursts
@@ -178,7 +180,11 @@ class Live:
         while True:
             await asyncio.sleep(BEAT)
             now = time.monotonic()
-            changed = self._gather(now - before)
+            try:
+                changed = self._gather(now - before)
+            except Exception:  # noqa: BLE001 - what one node sends ends the live channel of no client
+                _log.exception("Values of one beat cannot be shown.")
+                self._channels, changed = {}, {}
             before = now
             if changed:
                 names = {f"{uuid}/{number}" for uuid, number in self._raw}

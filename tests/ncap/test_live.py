@@ -280,3 +280,28 @@ def test_what_a_client_missed_is_told_once() -> None:
     assert first == [{"type": "dropped", "messages": 2}, {"type": "values", "number": 2}]
     assert second == [{"type": "values", "number": 0}]
     assert third == [{"type": "dropped", "messages": 1}, {"type": "values", "number": 1}]
+
+
+def test_a_block_that_cannot_be_shown_ends_the_live_channel_of_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task that serves all clients ended with it, and no page changed any more until the next start."""
+    monkeypatch.setattr("teds_provision.ncap.live.BEAT", 0.001)
+    gather, tries = Live._gather, list[float]()
+
+    def fails_once(live: Live, seconds: float) -> dict[str, list[list[float | None]]]:
+        tries.append(seconds)
+        if len(tries) == 1:
+            raise OverflowError("int too large to convert to float")
+        return gather(live, seconds) or {"ab/1": [[1.0], [2.0]]}
+
+    monkeypatch.setattr(Live, "_gather", fails_once)
+
+    async def first_values() -> str:
+        live = Live()
+        client = live.join()
+        fan = asyncio.create_task(live.run())
+        try:
+            return (await asyncio.wait_for(client.wait(), PATIENCE))[-1]
+        finally:
+            fan.cancel()
+
+    assert json.loads(asyncio.run(first_values()))["channels"] == {"ab/1": [[1.0], [2.0]]}
