@@ -47,7 +47,7 @@ U, F64 = "unsigned", SampleChoice("float64", 8, 64, False)
         (replace(SPEED, low=0.0, high=9.0), SampleChoice("float32", 4, 32, False), (0.0, 9.0), None, ("OError",)),
         (COUNT, SampleChoice(U, 2, 8, True), (0.0, 255.0), (0, 255), ("OError",)),
         (replace(COUNT, bits=7), SampleChoice(U, 1, 7, True), (0.0, 127.0), (0, 127), None),
-        (replace(COUNT, bits=64), SampleChoice(U, 8, 64, True), (0.0, float(2**64 - 1)), None, None),
+        (replace(COUNT, bits=64), SampleChoice(U, 8, 64, True), (0.0, 1.84467440737096e19), None, None),
         (replace(COUNT, unit="V"), SampleChoice(U, 2, 8, True, 0, (0.0, 1.0)), (0.0, 255.0), None, None),
         (replace(COUNT, scale=-2.0), SampleChoice(U, 2, 8, True, 0, (0.0, -2.0)), (-510.0, 0.0), (0, 255), None),
         (replace(COUNT, signed=True), SampleChoice(U, 2, 8, True, 128, (-128.0, 1.0)), (-128.0, 127.0), None, None),
@@ -95,11 +95,13 @@ def test_limits_that_a_float32_would_exclude_are_moved_outward_by_one() -> None:
 
     above = neighbour(398.15, 1)
     assert float32(398.15) < 398.15 < above
-    assert OIL.held_limits == (-40.0, above - 273.15)
+    assert OIL.held_limits == (-40.0, 125.00002)
+    assert float32(125.00002 + 273.15) == above, "in as few digits as give it"
     below = neighbour(0.1, -1)
     assert float32(0.1) > 0.1 > below
-    assert replace(OIL, unit="V", low=0.1, high=0.5).held_limits == (below, 0.5)
-    assert replace(OIL, unit="V", low=-0.5, high=-0.1).held_limits == (-0.5, -below)
+    assert replace(OIL, unit="V", low=0.1, high=0.5).held_limits == (0.099999994, 0.5)
+    assert float32(0.099999994) == below
+    assert replace(OIL, unit="V", low=-0.5, high=-0.1).held_limits == (-0.5, -0.099999994)
     assert SPEED.held_limits == (-1e30, 1e30)
 
 
