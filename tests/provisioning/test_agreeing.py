@@ -27,6 +27,8 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import Board, talk
 
+from .test_provision import run as provisioned
+
 DONE = AgreeResult(3, "ab" * 8, fresh=True)
 
 
@@ -130,7 +132,7 @@ def test_a_key_from_a_backup_is_asked_about_where_no_tap_proves_it(
 
 
 def test_a_node_of_the_epoch_held_here_was_not_keyed_elsewhere(station: Station, board: Board) -> None:
-    keyed(station, board)
+    provisioned(station, board)  # a datasheet signed here tells nothing of another station
     with talk(board) as node:
         node.identity = replace(node.identity, epoch=1)
         assert agreed_elsewhere(station, node) == ""

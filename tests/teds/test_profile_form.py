@@ -33,7 +33,7 @@ sample = { model = "fraction", octets = 2, bits = 12 }
 sampling = { modes = ["trigger", "immediate"], default = "immediate" }
 """
 WRITTEN = """\
-# Profile made from TEDS. The UUID is the node's and stands in no profile.
+# Profile made from TEDS. The UUID belongs to the node, so a profile has none.
 title = "rich board"
 name = "rich board"
 
@@ -187,7 +187,7 @@ def test_what_a_profile_cannot_hold_is_at_its_top(tmp_path: Path) -> None:
         "CalTEDS of channel 1 (calibrations come from a file of their own).",
         "SecurityTEDS of channel 1 (made when a datasheet is signed).",
     )
-    head = "# Profile made from TEDS. The UUID is the node's and stands in no profile.\n"
+    head = "# Profile made from TEDS. The UUID belongs to the node, so a profile has none.\n"
     head += "".join(f"# Not held here: {sentence}\n" for sentence in lost)
     meta = (
         'title = "unnamed"\n\n[meta]\n'
