@@ -13,6 +13,7 @@ import pytest
 from teds_provision.errors import NotWhitelistedError, PolicyError, UsageError
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster
+from teds_provision.station.plant.plant import PlantConflictError
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import (
     Handover,
@@ -113,6 +114,7 @@ def test_trust_that_another_program_changed_is_reported_and_does_not_count(
     monkeypatch.setattr(station.policy, "_notify", told.append)
     station.policy.trust(trusted("north", NORTH))
     station.policy.trust(trusted("south", SOUTH))
+    station.policy.end_ca(WEST)
     store.execute(f"UPDATE trust SET {change} WHERE name = 'north'")
     station.policy.unlocked()
     name = "west" if "west" in change else "north"
@@ -280,3 +282,48 @@ def test_a_key_that_came_from_a_backup_waits_for_a_person(station: Station) -> N
     station.policy.require_not_restored(A)
     station.keys.demand_rotation(A, "of another owner")
     station.policy.require_not_restored(A)
+    station.keys.demand_rotation(A, "restored from a backup of 2026-03-01")
+    with pytest.raises(PolicyError) as caught:
+        station.policy.require_not_restored(A)
+    assert caught.value.message == f"The key of node {A.hex()} was restored from a backup of 2026-03-01."
+    station.policy.require_not_restored(B)
+
+
+TWO_KEYS = {"two keys": "north and west"}
+
+
+@pytest.mark.parametrize(
+    ("joined", "conflicts", "entry", "held", "refused"),
+    [
+        (True, TWO_KEYS, None, False, True),
+        (False, TWO_KEYS, None, False, False),
+        (True, {}, None, False, False),
+        (True, {"other pin": "why", "two holders": "why"}, None, False, False),
+        (True, TWO_KEYS | {"other pin": "why"}, None, False, True),
+        (True, TWO_KEYS, None, True, False),  # it was keyed here before
+        (True, TWO_KEYS, WhitelistEntry(A, KEY, AT), False, False),  # a person here pinned one of them
+        (True, TWO_KEYS, WhitelistEntry(A, None, AT), False, True),
+        (True, TWO_KEYS, WhitelistEntry(A, KEY, AT, "registry"), False, True),
+    ],
+)
+def test_a_node_with_two_keys_in_the_plant_is_not_keyed_for_the_first_time(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    joined: bool,
+    conflicts: dict[str, str],
+    entry: WhitelistEntry | None,
+    held: bool,
+    refused: bool,
+) -> None:
+    station.plant.claims.put_conflicts({A: conflicts, B: TWO_KEYS})
+    if entry is not None:
+        station.pins.restore([entry])
+    if held:
+        station.keys.add_pending(A, key=bytes(16), key_id=bytes(8), epoch=1)
+    monkeypatch.setattr(type(station.plant), "joined", property(lambda plant: object() if joined else None))
+    if not refused:
+        station.policy.require_undisputed(A)
+        return
+    with pytest.raises(PlantConflictError) as caught:
+        station.policy.require_undisputed(A)
+    assert caught.value.message == f"The plant's stations know two keys for node {A.hex()}: north and west."
