@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +12,8 @@ import pytest
 
 from teds_provision.errors import GarbledError, NodeSilentError, NotWhitelistedError, PolicyError
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning import agree as agreeing
 from teds_provision.provisioning.agree import (
     AgreeResult,
@@ -18,6 +22,7 @@ from teds_provision.provisioning.agree import (
     agreed_elsewhere,
     must_take_over,
     proof_of_reset,
+    require_own_ca,
     reset_node,
 )
 from teds_provision.provisioning.conversation import SessionLostError
@@ -25,7 +30,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
-from tests.bench import Board, talk
+from tests.bench import Board, make_station, talk
 
 from .test_provision import run as provisioned
 
@@ -141,6 +146,29 @@ def test_a_node_of_the_epoch_held_here_was_not_keyed_elsewhere(station: Station,
             "it reports key epoch 2, after 1 here: keyed elsewhere by tap or rotated by another holder (unverified);"
             " which station did so will show once it signs the datasheet"
         )
+
+
+def test_a_datasheet_of_another_owner_refuses_unless_a_key_of_the_node_is_held(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    provisioned(station, board)
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    assert image.security is not None
+    station.keys.remove(board.uuid)
+    require_own_ca(station, board.uuid, NodeState.PROVISIONED, image.security)
+    with closing(make_station(tmp_path / "other", "other")) as other:
+        for state, teds in ((NodeState.FACTORY, image.security), (NodeState.PROVISIONED, b"")):
+            require_own_ca(other, board.uuid, state, teds)
+        with pytest.raises(PolicyError) as refused:
+            require_own_ca(other, board.uuid, NodeState.PROVISIONED, image.security)
+        assert refused.value.message == (
+            f"Node {board.uuid.hex()} belongs to another owner's CA: station {fingerprint(station.point)[:16]} signed"
+            " its datasheet."
+        )
+        with other.transaction():
+            other.keys.add_pending(board.uuid, key=bytes(16), key_id=bytes(8), epoch=1)
+        require_own_ca(other, board.uuid, NodeState.PROVISIONED, image.security)
 
 
 def test_a_whitelist_entry_is_made_once_and_a_bare_one_replaces_none(station: Station, board: Board) -> None:
