@@ -166,7 +166,7 @@ def test_the_metrics_are_held_whole() -> None:
         "station": {"name": 'bench "A"\\\n'},
         "links": [
             {"place": "can:x", "state": "up", "nodes": 2, "strangers": 1},
-            {"place": "nfc:y", "state": "down", "nodes": 0, "strangers": 0},
+            {"place": "nfc:y", "state": "lent", "nodes": 0, "strangers": 0},
         ],
         "measurements": [
             {"id": "1", "nodes": [report | {"clock_error": 0.00125}, {"uuid": "cd", "state": "lost"}]},
