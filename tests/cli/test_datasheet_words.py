@@ -260,7 +260,7 @@ def test_what_ends_with_the_trust_is_listed_before_and_after(
         "  21 nodes whose key it holds: to be rotated at the next contact",
         *(f"    {uuid.hex()}" for uuid in shared[:20]),
         f"  the CA {fingerprint(OWNER.point)[:32]} is no longer trusted",
-        "    1 node keep it: reset and provision them again",
+        "    1 node keeps it: reset and provision it again",
         f"  its ban of node {NODE} is lifted",
         "  handover h-1 to it is still open, so it may have these keys; see handover list",
     ]

@@ -18,12 +18,12 @@ from teds_provision.plant.yield_stats import Attempt, StationYield, to_csv, yiel
 from teds_provision.protocol.keys import station_key_message
 from teds_provision.protocol.plant.job import open_job
 from teds_provision.protocol.plant.roster import Member
-from teds_provision.station.plant.line import EvidenceRow, UnitRow
+from teds_provision.station.plant.line import EvidenceRow, JobRow, UnitRow
 from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call
 
-from .owner import ALL, ANGLE, alone, job_of, join, member, roster_of
+from .owner import ANGLE, alone, job_of, join, roster_of
 
 ENDS = ("--ends", "2099-01-01T00:00:00Z")
 A, B, C = (bytes([number] * 10) for number in (1, 2, 3))
@@ -145,9 +145,6 @@ def test_what_no_job_can_say_is_refused(
     file = tmp_path / "boards.csv"
     file.write_text(f"uuid,fingerprint\n{A.hex()},{'ab' * 32}\n")
     owner, west = alone(tmp_path / "owner"), alone(tmp_path / "west")
-    join(
-        owner, roster_of(owner, member(owner, "owner", *ALL), replace(member(west, "west"), signature=b""))
-    ) if False else None
     with_west(owner, west)
     owner.close()
     west.close()
@@ -224,6 +221,19 @@ def test_jobs_are_listed_and_shown_as_they_are(home: Path) -> None:
     assert ask(home, "job", "show", "abcd")["state"] == "open"
     assert call(home, "job", "close", "abcd").out == f"Closed “[b]three[/] angles”, 3 × {ANGLE}, until {until}.\n"
     assert ask(home, "job", "show", "abcd")["state"] == "closed"
+
+
+def test_a_job_of_a_keeper_who_is_in_no_roster_any_more_hides_no_other(home: Path, tmp_path: Path) -> None:
+    a_job(home)
+    other = alone(tmp_path / "other")
+    gone = "ffff1111-8a55-4d9c-8e56-09c29c295609"
+    octets = job_of(other, id=gone)
+    other.close()
+    with opened(home) as station, station.transaction():
+        station.plant.line.add_job(JobRow(gone, "ab" * 32, octets))
+    outcome = call(home, "--json", "job", "list")
+    assert (outcome.code, [job["id"] for job in outcome.json["jobs"]]) == (0, [ID])
+    assert outcome.err == "Warning: Job ffff1111 is left out: no roster that is known here names its signer.\n"
 
 
 def test_evidence_is_listed_by_board_and_job(home: Path) -> None:

@@ -209,7 +209,8 @@ def _ended(removal: Removal) -> list[str]:
         lines += [f"    {uuid.hex()}" for uuid in removal.shared[:20]]
     lines += [f"  the CA {protocol_keys.fingerprint(ca)[:32]} is no longer trusted" for ca in removal.cas]
     if removal.under:
-        lines.append(f"    {count_of(removal.under)} keep it: reset and provision them again")
+        keeps, them = ("keeps", "it") if removal.under == 1 else ("keep", "them")
+        lines.append(f"    {count_of(removal.under)} {keeps} it: reset and provision {them} again")
     lines += [f"  its ban of node {uuid.hex()} is lifted" for uuid in removal.bans]
     lines += [
         f"  handover {id_} to it is still open, so it may have these keys; see handover list" for id_ in removal.open
