@@ -62,13 +62,15 @@ gc.set_threshold(50_000, 20, 100)  # parsing the whole package takes 3.2 s of CP
 
 
 def pytest_configure() -> None:
-    """Take Ctrl-C as usual: what a shell starts in the background ignores it, and so would the programs under test.
+    """Take Ctrl-C and the end of a terminal as usual: in the background, or under nohup, they are ignored by all below.
 
     Homes and recordings lie in memory if there is room: a test waits for a disk at every durable write, for nothing.
     And what the caller's environment says of terminals, proxies, ROS and this program is nothing that a test asked for.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if "TMPDIR" not in os.environ and _in_memory_is_room():
         os.environ["TMPDIR"] = tempfile.tempdir = str(IN_MEMORY)
     if len(tempfile.gettempdir()) > LONGEST_TEMPORARY and os.access("/tmp", os.W_OK | os.X_OK):
