@@ -507,7 +507,7 @@ def as_dict(entry: WhitelistEntry) -> dict[str, Any]:
 
 def named(station: Station, entries: Iterable[WhitelistEntry]) -> Iterator[WhitelistEntry]:
     """Yield the entries with the names that people see: the node's own if the entry has none."""
-    names = {record.uuid: record.name for record in station.nodes.all() if record.name}
+    names = station.nodes.names()
     for entry in entries:
         yield entry if entry.name else replace(entry, name=names.get(entry.uuid))
 

@@ -72,6 +72,10 @@ class Nodes:
         found = self._store.read_of_nodes(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes", uuids)
         return {record.uuid: record for record in found}
 
+    def names(self) -> dict[bytes, str]:
+        """Return the names of all nodes that have one, by UUID."""
+        return dict(self._store.execute("SELECT uuid, name FROM nodes WHERE name IS NOT NULL"))
+
     def all_shown_keys(self) -> Iterator[ExportEligibility]:
         """Give identity key and retirement of all nodes, by UUID, a chunk at a time."""
         after = b""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.station.nodes import Nodes
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import (
     Group,
@@ -105,6 +106,20 @@ def test_one_node_by_uuid_prefix_or_name(known: Path, text: str) -> None:
     shown = call(known, "nodes", text).out
     for part in ("[b]finger[/]", "0x21", "active, epoch 3", f"also held by {STATION[:16]}", "1 key pending"):
         assert part in shown
+
+
+@pytest.mark.parametrize("text", [ONE.hex(), "8d4d", "[b]finger[/]"])
+def test_one_node_is_shown_without_a_look_at_all_others(
+    known: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There may be 100,000."""
+
+    def looked(_nodes: Nodes) -> None:
+        raise AssertionError("all nodes are read")
+
+    monkeypatch.setattr(Nodes, "all", looked)
+    monkeypatch.setattr(Nodes, "names", looked)
+    assert ONE.hex() in call(known, "nodes", text).out
 
 
 def test_people_see_a_table_with_what_is_odd(known: Path) -> None:

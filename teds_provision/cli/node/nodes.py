@@ -94,8 +94,8 @@ def nodes(
     if fits is not None:
         show_fits(app, station, fits, found)
         return
-    if not app.json and form in (None, "table"):  # output for scripts remains sorted by UUID
-        names = {record.uuid: record.name for record in station.nodes.all()}
+    if len(found) > 1 and not app.json and form in (None, "table"):  # output for scripts remains sorted by UUID
+        names = station.nodes.names()
         found = sorted(found, key=lambda uuid: by_name(names.get(uuid), uuid.hex()))
     described = _with_views(station, (node.to_json() for node in inventory(station, found)))
     if app.json or form == "json":

@@ -407,11 +407,11 @@ def _stop(app: App, wanted: str) -> None:
 
 def _match_lines(station: Station, found: MatchSurvey, present: Set[str]) -> list[str]:
     """Return how many known nodes match now, and why the others do not."""
-    names = {record.uuid.hex(): record.name or record.uuid.hex() for record in station.nodes.all()}
+    names = {uuid.hex(): name for uuid, name in station.nodes.names().items()}
 
     def named(uuids: Sequence[str]) -> str:
         more = f" and {len(uuids) - _MOST_NAMED} more" if len(uuids) > _MOST_NAMED else ""
-        return ", ".join(shown(names[uuid]) for uuid in uuids[:_MOST_NAMED]) + more
+        return ", ".join(shown(names.get(uuid, uuid)) for uuid in uuids[:_MOST_NAMED]) + more
 
     matching = found.matching
     there = sum(uuid in present for uuid in matching)
