@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks import short
 from tests.parsed import parsed
 
 ROOT = Path(__file__).parent.parent
@@ -237,3 +238,7 @@ def parsed_room(files: dict[str, Path], room: str) -> ast.Module:
     """Return the ``__init__`` of a room, parsed; nothing for a module."""
     path = files.get(f"{room}.__init__")
     return parsed(path) if path is not None else ast.Module([], [])
+
+
+def test_every_benchmark_has_a_short_run() -> None:
+    assert short.unlisted() == []
