@@ -32,7 +32,7 @@ LEAST: dict[str, tuple[tuple[str, ...], ...]] = {
     "newcomers": (("--joins", "1", "--many", "5", "--seconds", "1"),),
     "nodes": (),
     "page": (("--seconds", "1"),),
-    "plant": (("--stations", "2", "--pages", "2", "--events", "1"), ("--local", "5")),
+    "plant": (("--stations", "3", "--pages", "2", "--events", "1"), ("--local", "12")),
     "provisioning": (("--nodes", "1"),),
     "radio": ((),),
     "recordings": (("--samples", "10000"),),
