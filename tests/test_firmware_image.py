@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from teds_provision import firmware_image
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
 from teds_provision.firmware_image import (
     FirmwareImage,
@@ -105,3 +107,21 @@ def test_the_package_that_is_missing_is_named(owner: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(NotFoundError, match=f"needs the package {package}\\."):
         read_firmware_image(b"")
+
+
+def test_an_image_names_one_board_and_one_counter_at_most() -> None:
+    """Of imgtool's reading of its TLVs: 0x10 SHA-256, 0x50 the security counter, 0x54A0 our name of the board."""
+
+    def tlv(kind: int, octets: bytes) -> dict[str, Any]:
+        return {"type": kind, "len": len(octets), "data": octets.hex()}
+
+    board, other, counter = tlv(0x54A0, b"a"), tlv(0x54A0, b"b"), tlv(0x50, b"\x07\0\0\0")
+
+    def named(*protected: dict[str, Any]) -> tuple[str | None, int | None]:
+        area = {"tlvs_prot": list(protected), "tlvs": [tlv(0x10, bytes(32))]}
+        return firmware_image._named_in({"tlv_area": area, "trailer": None}, bytes(32))
+
+    assert named(board, counter) == ("a", 7)
+    for protected in ((board, other), (board, board), (counter, counter)):
+        with pytest.raises(BadDataError):
+            named(*protected)

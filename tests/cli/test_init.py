@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from teds_provision import lazy
+from teds_provision.cli.context import read_line
 from teds_provision.lazy import how_to_install
 from teds_provision.protocol.keys import fingerprint, from_pem
 
@@ -218,3 +220,21 @@ def test_every_extra_that_a_hint_names_is_one() -> None:
     }
     assert {"ble", "ncap", "parquet", "registry", "units"} <= named
     assert named <= declared.keys()
+
+
+def test_keys_come_from_one_place(tmp_path: Path) -> None:
+    for name in ("ca.pem", "lab.cert"):
+        (tmp_path / name).write_text("x")
+    outcome = call(tmp_path / "home", "init", "--ca", tmp_path / "ca.pem", "--certificate", tmp_path / "lab.cert")
+    assert outcome.code == 2
+    assert "--ca" in outcome.err
+    assert not (tmp_path / "home" / "store.sqlite3").exists()
+
+
+def test_a_passphrase_from_a_descriptor_keeps_its_blanks() -> None:
+    for given, read in ((b"  two words \r\n", "  two words "), (b"\ttab\n rest\n", "\ttab"), (b"x", "x")):
+        near, far = os.pipe()
+        os.write(far, given)
+        os.close(far)
+        assert read_line(near) == read
+        os.close(near)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -129,3 +130,19 @@ def test_a_value_is_sent_again_after_a_quarter_of_the_dead_man_and_half_a_second
     assert held()[0].pause == pytest.approx(DEAD_MAN / 4000)
     slow: Any = Node(ChannelState.SAFE, quiet, quiet)
     assert HeldActuator(VerifiedSession(slow, SHEET, "00" * 32, "g"), 1, dead_man=10_000).pause == pytest.approx(0.5)
+
+
+def test_a_quantity_means_its_set_point_unless_an_actuator_has_that_name() -> None:
+    def named(*names: str) -> VerifiedSession:
+        channels = [SimpleNamespace(name=name, actuator=name != "force") for name in names]
+        return cast("VerifiedSession", SimpleNamespace(sheet=SimpleNamespace(channels=channels)))
+
+    def meant(trusted: VerifiedSession, chosen: int | str) -> str | None:
+        found = held_actuator._set_point_of(trusted, chosen)
+        return None if found is None else found.name
+
+    gripper = named("opening set point", "force", "valve", "valve set point")
+    assert meant(gripper, "Opening") == "opening set point"
+    assert meant(gripper, "valve") is None  # it is an actuator itself
+    assert meant(gripper, "force") is None
+    assert meant(gripper, 1) is None

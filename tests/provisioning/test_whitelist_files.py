@@ -15,6 +15,7 @@ from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError,
 from teds_provision.provisioning.whitelist import (
     FORMATS,
     ListedNode,
+    _WhitelistReader,
     add,
     form_of,
     named,
@@ -445,3 +446,11 @@ def test_a_node_without_a_name_of_its_own_in_the_list_is_shown_by_its_datasheet(
     station.nodes.remember(TWO, name="own 2")
     listed = (WhitelistEntry(ONE), WhitelistEntry(TWO, name="listed"), WhitelistEntry(bytes(10)))
     assert [entry.name for entry in named(station, listed)] == ["own", "listed", None]
+
+
+def test_a_whitelist_has_a_quarter_of_a_million_entries_and_no_more() -> None:
+    reader = _WhitelistReader("list.csv", count=249_999)
+    reader.add(1, {"uuid": "8d4d9da65281f7000000"})
+    assert (reader.mistakes, len(reader.entries)) == ([], 1)
+    with pytest.raises(BadDataError, match=r"list\.csv:2: there are more than 250000 entries"):
+        reader.add(2, {"uuid": "8d4d9da65281f7000001"})

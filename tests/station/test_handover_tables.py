@@ -139,3 +139,9 @@ def test_new_rows_at_once_have_macs_and_never_take_the_place_of_others(station: 
     with pytest.raises(StoreError):
         station.bulk.put(BulkRows(new_nodes=[node._replace(uuid=bytes(10)), node._replace(name="right")]))
     assert [record.name for record in station.nodes.all()] == ["left"]
+
+
+def test_handovers_are_listed_from_the_oldest_on_whatever_their_ids(station: Station) -> None:
+    for first, at in (("f", "2026-01-30T10:00:00Z"), ("0", "2026-01-30T10:00:05Z"), ("a", "2026-01-30T10:00:05Z")):
+        station.handovers.put(Handover(first, "out", "copy", (), "open", "{}", None, None, at))
+    assert [row.id for row in station.handovers.all()] == ["f", "0", "a"]

@@ -6,10 +6,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.teds import plot
 from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
 from teds_provision.teds.plot import plot_blocks
 from teds_provision.teds.profile import load_profile, shipped_profiles
@@ -126,3 +129,11 @@ def test_a_picture_names_the_node(tmp_path: Path) -> None:
     drawn = (tmp_path / "x.svg").read_text()
     assert "crane slew angle" in drawn
     assert UUID.hex() in drawn
+
+
+def test_a_thinned_curve_is_drawn_from_its_first_point_to_its_last() -> None:
+    mask = np.ones(10_001, dtype=bool)
+    mask[:3] = False
+    drawn = plot._View._thinned(cast(Any, None), mask)
+    assert (drawn[0], drawn[-1]) == (3, 10_000)
+    assert 1_900 < len(drawn) < 2_700
