@@ -195,3 +195,14 @@ def test_a_datasheet_that_was_refused_is_tried_again_once_its_node_was_reset(mon
     comes(NodeState.FACTORY)
     comes(NodeState.KEYED)
     assert (len(tried), events) == (2, ["not adopted"] * 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [(None, "calibration.csv"), ("Cell.CSV", "calibration.csv"), ("a.b.Json", "calibration.json")]
+)
+def test_a_calibration_is_of_the_form_that_its_name_ends_in(tmp_path: Path, name: str | None, file: str) -> None:
+    made = provisioning._file(tmp_path, "raw,value\n", name)
+    assert made == tmp_path / file
+    assert made.read_text() == "raw,value\n"
+    with pytest.raises(UsageError, match=r"Unsupported calibration file: 'cell\.xls'"):
+        provisioning._file(tmp_path, "x", "cell.xls")

@@ -13,6 +13,7 @@ import pytest
 from teds_provision.cli.rendering import local_time as local
 from teds_provision.errors import UsageError
 from teds_provision.plant.commands import line as commands
+from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.yield_stats import Attempt, StationYield, to_csv, yield_stats
 from teds_provision.protocol.keys import station_key_message
@@ -326,3 +327,22 @@ def test_the_status_of_a_job_as_a_table(home: Path, monkeypatch: pytest.MonkeyPa
         "teds-provision job status abcd1111 DIR",
     ]
     assert json.loads(call(home, "--json", "job", "status", "abcd").out)["stations"][1]["name"] == "west"
+
+
+def test_a_job_takes_no_datasheet_of_another_base(home: Path) -> None:
+    a_job(home)
+    for words in (("--job", "abcd"), ("--job", "abcd", "--all")):
+        refused = call(home, "--json", "provision", *words, "--adopt", "--nfc", "udp:localhost:9")
+        assert (refused.code, refused.json["error"]["message"]) == (
+            2,
+            "The sheet or job already defines what each board gets.",
+        )
+
+
+def test_a_dry_run_of_an_export_of_evidence_makes_no_folder(home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "proofs"
+    with opened(home) as station:
+        assert export(station, [], folder, write=False) == {}
+        assert not folder.exists()
+        assert export(station, [], folder) == {}
+        assert folder.is_dir()

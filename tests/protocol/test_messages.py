@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadDataError
+from teds_provision.protocol.messages import arguments
 from teds_provision.protocol.messages.arguments import size_of, words
 from teds_provision.protocol.messages.message import (
     compose_command,
@@ -267,3 +268,14 @@ def test_every_network_service_comes_back_as_it_was_composed(number, message_typ
     values = _arguments(data, layout)
     message = decode_message(compose_service(*number, message_type, values))
     assert {a.name: a.value for a in message.arguments} == values
+
+
+def test_a_reply_to_drive_names_the_run_before_the_octets_of_a_message():
+    request = decode_message(bytes([0, 0, 128, 20, 0, 2, 1, 2]))
+    reply = decode_message(bytes([1, 0, 4, 0, 7, 0, 24]), request=request)
+    assert [(argument.name, argument.value) for argument in reply.arguments] == [("run", 7), ("message_octets", 24)]
+
+
+@pytest.mark.parametrize(("tag", "fits"), [(0, False), (1, True), (21, True), (22, False)])
+def test_type_codes_of_tagged_arguments_are_1_to_21(tag, fits):
+    assert arguments._tag_fits(tag, arguments.TAGS.get(tag, 3), "no kind that is listed") is fits

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError
-from teds_provision.teds.codec.frame import frame, raw_tuple
+from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from tests.teds.strategies import some_fields
 from tests.teds.vectors import TEDS, octets_of
 
@@ -162,3 +162,10 @@ def test_habits_of_other_people_are_read_with_a_remark(area: bytes, length: int,
 def test_texts_that_cannot_be_written(fields: dict[str, object]) -> None:
     with pytest.raises(BadDataError):
         teds.compose(10, fields)
+
+
+def test_a_number_that_is_none_keeps_its_bits() -> None:
+    octets = teds.compose(5, {"OError": float("nan")})
+    other = frame(unframe(octets).replace(bytes.fromhex("7fffffff"), bytes.fromhex("ffc01234")))
+    assert other != octets
+    assert teds.recompose(teds.decode(other)) == other
