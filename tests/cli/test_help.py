@@ -153,3 +153,13 @@ def test_a_shell_is_told_how_a_line_goes_on(typed: str, offered: list[str]) -> N
     assert (
         "_teds_provision_completion" in spawn(environment=clean_environment(_TEDS_PROVISION_COMPLETE="bash_source")).out
     )
+
+
+def test_every_output_file_is_named_by_o_too() -> None:
+    without = {
+        words
+        for words, command in ALL.items()
+        for option in command.params
+        if "--output" in option.opts and "-o" not in option.opts
+    }
+    assert without == set()

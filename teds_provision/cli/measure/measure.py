@@ -76,7 +76,7 @@ CONTINUED_WITH = {"test_pattern": "test pattern", "unsigned": "including unsigne
     help="Write .csv and .txt as one table: a row per time, a column per channel, no raw values.",
 )
 @file_units_option
-@click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="With recover: the new file.")
+@click.option("--output", "-o", type=click.Path(path_type=Path), metavar="FILE", help="With recover: the new file.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")

@@ -91,6 +91,7 @@ class KeyCarrier(Protocol):
 )
 @click.option(
     "--output",
+    "-o",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     help="Where to write the sealed bundle.",

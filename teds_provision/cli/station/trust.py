@@ -278,7 +278,7 @@ def create(app: App) -> None:
     epilog=examples("teds-provision trust ca sign lab.request --output lab.cert --yes"),
 )
 @click.argument("request", type=FileToRead())
-@click.option("--output", type=_FILE, required=True, metavar="CERT", help="Where to write the certificate.")
+@click.option("--output", "-o", type=_FILE, required=True, metavar="CERT", help="Where to write the certificate.")
 @yes_option
 @dry_run_option
 @pass_app
