@@ -503,11 +503,11 @@ def _already(plan: ExportPlan, output: Path, now: datetime) -> str | None:
     notes = BundleNotes.from_json(plan.earlier.nodes)
     if digest not in notes.files:
         return None
-    why = "was sealed anew since, because it was out of date" if digest in notes.stale else notes.why_stale(now)
+    why = "was sealed again since, because it was out of date" if digest in notes.stale else notes.why_stale(now)
     if why:
         raise UsageError(
             f"The bundle in {output} {why}.",
-            hint="Delete the file, or choose another name, and run this again: the bundle is then sealed anew.",
+            hint="Delete the file, or choose another name, and run this again: the bundle is then sealed again.",
         )
     return digest
 
@@ -600,7 +600,7 @@ def _files_before(plan: ExportPlan) -> tuple[str, ...]:
 
 
 def _stale_before(plan: ExportPlan, now: datetime | None) -> tuple[str, ...]:
-    """Return the digests of those that no receiver takes at ``now``, when the bundle is sealed anew."""
+    """Return the digests of those that no receiver takes at ``now``, when the bundle is sealed again."""
     notes = BundleNotes.from_json(plan.earlier.nodes) if plan.earlier else None
     if notes is None:
         return ()

@@ -74,7 +74,7 @@ class Buses:
         self.close()
 
     def add(self, port: MeasuringLink) -> MeasuredBus:
-        """Hear one more bus; one that was opened anew is heard in place of its closed port."""
+        """Hear one more bus; one that was opened again replaces its closed port."""
         known = self._buses.get(port.place)
         if known is not None and known.port is port:
             return known

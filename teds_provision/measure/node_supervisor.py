@@ -245,7 +245,7 @@ class NodeSupervisor:
             return lost.cause
         except TedsProvisionError as error:
             return error
-        except Exception as bug:  # noqa: BLE001 - a thread that ends without a word looks like an end in order
+        except Exception as bug:  # noqa: BLE001 - a thread that ends unreported looks like a normal end
             _log.debug("Measuring node %s failed.", self.uuid.hex(), exc_info=True)
             return InternalError(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
         return None
@@ -446,7 +446,7 @@ class NodeSupervisor:
         self, bus: MeasuredBus, trusted: VerifiedSession, channels: list[Channel], address: int
     ) -> NodePlans:
         rate, share = self._request.rate, bus.share
-        halved = 0  # anew in each session: other firmware may allow what the last one refused
+        halved = 0  # counted from 0 in each session: other firmware may allow what the last one refused
         if rate is None:
             share.announce_share(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON, halved).load)
         start = self._common_start.start(self.uuid, self.streams.clock)

@@ -117,7 +117,7 @@ class TopicActuators:
                     self._refuse(f"channel {command.channel}: the session was lost: {lost.cause.message}")
                 except TedsProvisionError as error:
                     self._refuse(f"channel {command.channel}: {error.message}")
-                except Exception as bug:  # noqa: BLE001 - a thread that ends takes no set point any more, without a word
+                except Exception as bug:  # noqa: BLE001 - a thread that ends takes no further set point, and nothing reports it
                     _log.debug("Set point of channel %d failed.", command.channel, exc_info=True)
                     self._refuse(f"channel {command.channel}: unexpected {type(bug).__name__}, which is a bug")
 

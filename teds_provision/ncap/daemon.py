@@ -260,7 +260,7 @@ class Daemon:
                 return
             except StoreError as failure:  # temporary: the next read may succeed
                 _log.warning("The store cannot be read: %s", failure.message)
-            except Exception:  # noqa: BLE001 - a thread that ends without a word would follow no change any more
+            except Exception:  # noqa: BLE001 - a thread that ends unreported would follow no further change
                 _log.exception("Following the changes of the store failed; it goes on.")
 
     def _look_at_vault(self) -> None:

@@ -28,7 +28,7 @@ FILES = "file:"
 def request(station: Station) -> bytes:
     """Give this station's request to be a member, signed; the same again while name and certificate are the same.
 
-    One that a wrong clock dated too far ahead is made anew, with the same login: nobody takes it before its time.
+    One that a wrong clock dated too far ahead is made again, with the same login: no keeper accepts it before its date.
     """
     kept = station.plant.login()
     secret = os.urandom(scram.SECRET_OCTETS) if kept is None else kept[0]

@@ -57,7 +57,7 @@ def test_a_file_that_no_receiver_takes_is_not_called_done(pair: Pair, days: int,
     assert export_bundle(pair.north, plan, anew, now).fresh
     plan = plan_export(pair.north, order, now=now)
     assert not export_bundle(pair.north, plan, anew, now).fresh
-    with pytest.raises(UsageError, match="sealed anew since"):
+    with pytest.raises(UsageError, match="sealed again since"):
         export_bundle(pair.north, plan, path, now)
     taken = plan_import(pair.south, anew.read_bytes(), now)
     assert isinstance(taken, ImportPlan)

@@ -182,7 +182,7 @@ class MeasurementJob:
                     return
             except TedsProvisionError as error:
                 self.error = error
-            except Exception as bug:  # noqa: BLE001 - a thread that ends without a word looks like an end in order
+            except Exception as bug:  # noqa: BLE001 - a thread that ends unreported looks like a normal end
                 _log.exception("Measurement %s failed.", self.kept.id)
                 self.error = InternalError(
                     f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv."

@@ -281,7 +281,7 @@ class ThreadedSink(ABC):
             self._fail(error)
         except OSError as error:
             self._fail(as_sink_failure(error, self.name))
-        except Exception as bug:  # noqa: BLE001  a thread that ends without a word looks like an end in order
+        except Exception as bug:  # noqa: BLE001  a thread that ends unreported looks like a normal end
             self._fail_by_bug(bug)
         finally:
             self._end()
