@@ -331,6 +331,38 @@ def wait_for(what: Callable[[], object]) -> bool:
     return True
 
 
+@pytest.mark.parametrize("kind", ["pipe", "program", "socket"])
+def test_no_value_is_valid_any_more_when_the_end_is_reported(tmp_path: Path, kind: str) -> None:
+    """Who reads the notice and then a sample must not get the last value as a valid one."""
+    line, found, reported = b'{"t": 1, "value": {"angle": 1}}\n', [], threading.Event()
+    program = tmp_path / "hand.py"
+    program.write_text(f"print({line.decode()!r}, flush=True, end='')\ninput()\n")
+
+    def notified(text: str) -> None:
+        found.append((text, source.at(1, 1.0)))
+        reported.set()
+
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as stream, socket.socket(socket.AF_UNIX) as simulation:
+        path = tmp_path / "hand.sock"
+        word = {"program": f"exec:{sys.executable} {program}", "socket": f"unix:{path}"}.get(kind)
+        source = StandardInput(PLACES, notified, stream) if word is None else make_source(word, PLACES, notified)
+        source.start(Clock())
+        if kind == "pipe":
+            os.write(writing, line)
+        elif kind == "socket":
+            simulation.connect(str(path))
+            simulation.sendall(line)
+        assert wait_for(lambda: source.at(1, 1.0) == Reading(value=1.0))
+        os.close(writing)
+        simulation.close()
+        source.acted({"angle": 1.0})  # the line for which the program waits
+        assert reported.wait(60)
+        source.stop()
+    assert found[-1][1] is None
+    assert "all values are invalid" in found[-1][0]
+
+
 def test_standard_input_ends_and_the_node_stays() -> None:
     reading, writing = os.pipe()
     messages: list[str] = []
@@ -344,7 +376,8 @@ def test_standard_input_ends_and_the_node_stays() -> None:
         assert clock.ended.wait(60)
         assert clock.steps == [1.0, 2.0]
         assert source.at(1, 2.0) is None
-        assert "end" in messages[0]
+        assert wait_for(lambda: messages)
+        assert messages == ["Standard input has ended: from now on all values are invalid."]
         source.stop()
 
 
@@ -402,6 +435,7 @@ def test_a_program_gives_values_is_told_what_actuators_do_and_may_end(tmp_path: 
     source.acted({"gripper": 0.0})
     assert clock.ended.wait(60)
     assert source.at(1, 0.0) is None
+    assert wait_for(lambda: messages)
     assert "ended with 3" in messages[0]
     source.stop()
     with pytest.raises(NotFoundError):

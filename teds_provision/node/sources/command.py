@@ -67,8 +67,8 @@ class CommandSource(LineSource):
         feed(lambda: os.read(descriptor, 65536), self.feed_line)
         code = self._process.wait()
         if not self._stopped:
-            self._notify(f"The program {self._words[0]} ended with {code}: from now on all values are invalid.")
             self.end()
+            self._notify(f"The program {self._words[0]} ended with {code}: from now on all values are invalid.")
 
 
 def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> CommandSource:

@@ -170,8 +170,8 @@ class StandardInput(LineSource):
         descriptor = self._stream.fileno()
         feed(lambda: b"" if self._stop.is_set() else os.read(descriptor, 65536), self.feed_line)
         if not self._stop.is_set():
-            self._notify("Standard input has ended: from now on all values are invalid.")
             self.end()
+            self._notify("Standard input has ended: from now on all values are invalid.")
 
 
 class UnixSocket(LineSource):
@@ -241,8 +241,8 @@ class UnixSocket(LineSource):
                 feed(lambda: self._receive(peer), self.feed_line)
                 self._peer = None
             if not self._stop.is_set():
-                self._notify("The simulation disconnected: until the next one connects, all values are invalid.")
                 self.end()
+                self._notify("The simulation disconnected: until the next one connects, all values are invalid.")
 
     def _receive(self, peer: socket.socket) -> bytes:
         while not self._stop.is_set():
