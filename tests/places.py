@@ -19,21 +19,57 @@ _OF_OURS = range(10_000, 32_000)  # below those that the system deals out to oth
 _dice = random.SystemRandom()
 
 
+class _Claims:
+    """Ports that this process has taken for its tests, each a locked octet of one file, so that no other takes them.
+
+    That a port is free now says nothing of the moment at which a node binds it: two of eight workers that look at once
+    would sometimes take the same one. The locks end with the process.
+    """
+
+    def __init__(self) -> None:
+        self.process = os.getpid()
+        self._taken: set[int] = set()  # a process can lock its own octet twice
+        file = Path(tempfile.gettempdir(), f"teds-provision-tests-{os.getuid()}-ports")
+        self._file = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+
+    def claim(self, kind: socket.SocketKind, port: int) -> bool:
+        """Take a port, or return False if this or another process has it."""
+        place = int(kind) << 16 | port
+        if place in self._taken:
+            return False
+        try:
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+        except OSError:
+            return False
+        self._taken.add(place)
+        return True
+
+
+_claims: list[_Claims] = []  # at most one; of a forked process its own
+
+
+def _claim(kind: socket.SocketKind, port: int) -> bool:
+    if not _claims or _claims[0].process != os.getpid():
+        _claims[:] = [_Claims()]
+    return _claims[0].claim(kind, port)
+
+
 def _free(kind: socket.SocketKind) -> int:
     while True:
         port = _dice.choice(_OF_OURS)
         with socket.socket(socket.AF_INET, kind) as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))
-            return port
+            if _claim(kind, port):
+                return port
 
 
 def free_udp_port() -> int:
-    """Return a UDP port of 127.0.0.1 that is free."""
+    """Return a UDP port of 127.0.0.1 that is free, and that no other test is given as long as this process lives."""
     return _free(socket.SOCK_DGRAM)
 
 
 def free_tcp_port() -> int:
-    """Return a TCP port of 127.0.0.1 that is free."""
+    """Return a TCP port of 127.0.0.1 that is free, and that no other test is given as long as this process lives."""
     return _free(socket.SOCK_STREAM)
 
 

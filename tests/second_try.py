@@ -2,10 +2,10 @@
 
 On a busy machine one scheduling accident among ten thousand tests must not refuse a release, but no defect may hide
 behind a retry. So only tests that start processes or use network ports get one, three at most, and only if each failed
-in its own body. Each then runs alone, twice, and must pass both times. The tests of a file for which one shared fixture
-failed (a measurement that all of them look at) count as one, and run together, without others. Everything else keeps
-its failure: pure tests, more than three, an error of collection, of a test's own setup, or teardown, and a worker that
-crashed.
+in its body or its setup. Each then runs alone, twice, and must pass both times. The tests of a file for which one
+shared fixture failed (a measurement that all of them look at) count as one, and run together, without others.
+Everything else keeps its failure: pure tests, more than three, an error of collection or of a teardown, and a worker
+that crashed.
 
 The failures that a second try cleared are printed, and appended to build/second-tries, which ``make test`` prints last.
 
@@ -39,9 +39,9 @@ PORTS = frozenset({"socket.bind", "socket.connect"})
 
 @dataclass(frozen=True)
 class Failure:
-    """The body of a test that failed: its id, the text of the failure, and why it may be tried again ("" if not).
+    """A test that failed: its id, the text of the failure, and why it may be tried again ("" if not).
 
-    ``fixture`` is the shared fixture that failed before the body, "" if the body itself did.
+    ``fixture`` is the shared fixture that failed before it, "" if its body or its own setup did.
     """
 
     test: str
@@ -84,7 +84,7 @@ def refusal(code: int, outcomes: Outcomes | None) -> str:
     if outcomes is None or code != pytest.ExitCode.TESTS_FAILED:
         return f"pytest ended with {int(code)}"
     if outcomes.errors:
-        return f"more than the body of a test failed: {'; '.join(outcomes.errors)}"
+        return f"more than setup or body of a test failed: {'; '.join(outcomes.errors)}"
     if not outcomes.failures:
         return "no test is recorded as failed"
     if len(accidents(outcomes.failures)) > MOST:
@@ -200,7 +200,7 @@ class _Watch:
         report = yield
         if report.failed:
             setattr(report, _BECAUSE, self._because(item))
-            setattr(report, _FIXTURE, self._failed_fixture(item))
+            setattr(report, _FIXTURE, self._failed_fixture(item) if report.when == "setup" else "")
         return report
 
     def _failed_fixture(self, item: pytest.Item) -> str:
@@ -242,11 +242,9 @@ class _Record:
             self.outcomes.passed.append(report.nodeid)
 
     def _record_failure(self, report: pytest.TestReport, because: str, fixture: str) -> None:
-        if report.when == "call":
-            self.outcomes.failures.append(Failure(report.nodeid, report.longreprtext, because))
-        elif report.when == "setup" and fixture:
+        if report.when in {"setup", "call"}:
             self.outcomes.failures.append(Failure(report.nodeid, report.longreprtext, because, fixture))
-        else:  # a test's own setup, teardown, or ??? for a worker that crashed
+        else:  # teardown, or ??? for a worker that crashed
             self.outcomes.errors.append(f"{report.when} of {report.nodeid}")
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:

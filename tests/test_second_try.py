@@ -102,8 +102,9 @@ def test_both_runs_alone_must_pass(suite: Suite) -> None:
         "def test_it(): socket.socket().bind(('127.0.0.1', 0)); fails_once()",
         "@pytest.fixture(scope='module')\ndef ran(): subprocess.run(['true'])\n"
         "def test_first(ran): pass\ndef test_it(ran): fails_once()",
+        "@pytest.fixture\ndef ran():\n    subprocess.run(['true'])\n    fails_once()\ndef test_it(ran): pass",
     ],
-    ids=["process", "port", "process of the module"],
+    ids=["process", "port", "process of the module", "process of its setup"],
 )
 def test_a_process_or_port_of_the_test_is_noticed(suite: Suite, body: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """One run alone is enough here."""
@@ -130,16 +131,20 @@ def test_a_test_skipped_alone_does_not_pass(suite: Suite) -> None:
 @pytest.mark.parametrize(
     ("body", "why"),
     [
-        ("@pytest.mark.link\ndef test_it(): os._exit(3)", "more than the body of a test failed: "),
+        ("@pytest.mark.link\ndef test_it(): os._exit(3)", "more than setup or body of a test failed: "),
         ("raise ValueError('no suite')", "pytest ended with 2"),
         (
-            "@pytest.fixture\ndef made(): fails_once()\n@pytest.mark.link\ndef test_it(made): pass",
-            "more than the body of a test failed: setup of test_it.py::test_it",
+            "@pytest.fixture\ndef made():\n    yield\n    fails_once()\n@pytest.mark.link\ndef test_it(made): pass",
+            "more than setup or body of a test failed: teardown of test_it.py::test_it",
+        ),
+        (
+            "@pytest.fixture\ndef made(): fails_once()\ndef test_it(made): pass",
+            "no other process or network port takes part in test_it.py::test_it",
         ),
     ],
-    ids=["worker", "collection", "setup"],
+    ids=["worker", "collection", "teardown", "setup without a process"],
 )
-def test_what_is_no_failed_body_keeps_the_run_red(suite: Suite, body: str, why: str) -> None:
+def test_what_is_no_failed_test_keeps_the_run_red(suite: Suite, body: str, why: str) -> None:
     suite.run(body, *(["-p", "xdist", "-n", "1"] if "_exit" in body else []))
     assert suite.code != 0
     assert f"No second try: {why}" in suite.printed

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
-import random
 import re
 import shutil
 import signal
-import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,19 +26,6 @@ from tests.zygote import FIRST_FD, Child, Zygote
 PASSPHRASE = "correct horse battery"
 READY = 60.0
 WORKED = 20.0
-_LOWEST, _PORTS = 10_000, 22_000  # below those that the system deals out
-_numbers = itertools.count(random.SystemRandom().randrange(_PORTS))
-
-
-def own_links() -> Links:
-    """A reader and a bus that no other trial of this process has: ports in their order, each bus its own group."""
-    while True:
-        number = next(_numbers) % _PORTS
-        reader, bus = _LOWEST + number, _LOWEST + (number + _PORTS // 2) % _PORTS
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-            probe.bind(("127.0.0.1", reader))
-            group = f"239.74.{164 + number // 250}.{1 + number % 250}"
-            return Links(f"udp:localhost:{reader}", f"udp_multicast:{group}?port={bus}")
 
 
 @dataclass(frozen=True)
@@ -66,7 +50,7 @@ class Desk:
 
     folder: Path
     zygote: Zygote
-    links: Links = field(default_factory=own_links)
+    links: Links = field(default_factory=Links)
 
     @property
     def home(self) -> Path:

@@ -33,7 +33,6 @@ from teds_provision.station.station import initialise
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Links
-from tests.faults.desk import own_links
 from tests.measure.rig import provisioned
 from tests.pace import PATIENCE
 from tests.zygote import FIRST_FD, Child, Zygote
@@ -102,7 +101,7 @@ class Scene:
 
     def __init__(self, folder: Path, zygote: Zygote) -> None:
         self.folder, self.zygote = folder, zygote
-        self.links: Links = own_links()
+        self.links = Links()
         self.passphrases = dict.fromkeys(HOMES, OLD_PASSPHRASE)
         self._powered: list[Child] = []
 
