@@ -283,6 +283,34 @@ class RemoteOffice:
         self.transport.close()
 
 
+class JoinedOffice:
+    """An office behind the registry that this station is connected to, wherever ``registry connect`` moves it.
+
+    A request that waits for its answer ends at the place at which it was made; the next one goes to the new place.
+    """
+
+    def __init__(self, station: Station, timeout: float) -> None:
+        self._station, self._timeout = station, timeout
+        self._lock = threading.Lock()
+        self._place = connecting.place_of(station)
+        self._offices = [RemoteOffice(station, transport_for(station, None), timeout)]
+
+    def request_signature(self, request: SignRequest) -> bytes | None:
+        """Return the answer to a request, None if none came in time; raises PolicyError if no registry is joined."""
+        with self._lock:
+            place = connecting.place_of(self._station)
+            if place != self._place:
+                self._offices.append(RemoteOffice(self._station, transport_for(self._station, None), self._timeout))
+                self._place = place
+            office = self._offices[-1]
+        return office.request_signature(request)
+
+    def close(self) -> None:
+        """Close what was opened for each place; other readers may have waited at an earlier one until now."""
+        for office in self._offices:
+            office.close()
+
+
 @dataclass
 class FileOffice:
     """No office at hand: the request is written to a file, and nothing comes back."""

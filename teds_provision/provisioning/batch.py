@@ -438,7 +438,8 @@ class BatchRun:
         if self.line is not None and self.line.only_verify:
             return listed
         if not listed or self.progress is not None:
-            self._station.notice(f"Skipped: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
+            missing = "whitelisted" if self.progress is None else "in the sheet"
+            self._station.notice(f"Skipped: node {uuid.hex()} is not {missing}.")
             return False
         judged = verdict_of(self._station, uuid)
         verified = judged is not None and judged.verified.verdict == "authentic"

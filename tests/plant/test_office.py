@@ -21,7 +21,14 @@ from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, RequestAheadError, answer
-from teds_provision.plant.sign_requests import Inbox, OfficeRefusedError, OfficeSilentError, RemoteOffice, send
+from teds_provision.plant.sign_requests import (
+    Inbox,
+    JoinedOffice,
+    OfficeRefusedError,
+    OfficeSilentError,
+    RemoteOffice,
+    send,
+)
 from teds_provision.plant.yield_stats import attempts_of, yield_stats
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, prove_message
 from teds_provision.protocol.plant import evidence as codec
@@ -435,6 +442,25 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
     answered = answer(desk.office, request.octets)
     assert answered is not None
     leave(answered, "88888888")
+    assert build(run, board).verified.verdict == "authentic"
+
+
+def test_a_line_asks_its_office_where_the_registry_is_now(desk: Desk, tmp_path: Path) -> None:
+    """A line under --watch asked at the place of its start for ever, after `registry connect` to another one."""
+    places = [tmp_path / "old", tmp_path / "new"]
+    run, board = desk.run(), make_board(1)
+    for place in places:
+        place.mkdir()
+        desk.line.plant.put_record(replace(desk.line.plant.joined, url=f"file:{place}"))
+        if run.office is desk.at_hand:
+            run.office = JoinedOffice(desk.line, 0.2)
+        with pytest.raises(OfficeSilentError):
+            build(run, board)
+        assert [file for file in (place / "to").rglob("*") if file.is_file()], place
+    inbox = Inbox(desk.office, FolderTransport(places[1]), SIGN_REQUEST)
+    assert [
+        done.answer.refused for done in office.answer_all(desk.office, FolderTransport(places[1]), inbox, None)
+    ] == [""]
     assert build(run, board).verified.verdict == "authentic"
 
 

@@ -40,6 +40,7 @@ from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import Board, contact
 from tests.pace import PATIENCE
 
@@ -558,3 +559,28 @@ def test_options_that_exclude_each_other_are_refused_before_anything(
         BatchRun(station, links, request_, SilentReporter())
     assert refused.value.message.startswith(message)
     BatchRun(station, LinkSettings(nfc=("a", "b")), ProvisionRequest(watch=True), SilentReporter())
+
+
+@pytest.mark.parametrize(
+    ("sheet", "listed", "said"),
+    [
+        (True, False, "is not in the sheet."),  # it said "not whitelisted", which adding it would not have helped
+        (True, True, "is not in the sheet."),
+        (False, False, "is not whitelisted."),
+        (False, True, None),
+    ],
+)
+def test_a_board_of_a_bus_that_is_not_meant_is_named_with_the_list_that_it_is_not_on(
+    station: Station, tmp_path: Path, sheet: bool, listed: bool, said: str | None
+) -> None:
+    file = tmp_path / "boards.csv"
+    file.write_text(f"uuid,name\n{board_of(1).hex()},left\n")
+    there = Board(uuid=board_of(2))
+    if listed:
+        station.pins.put(WhitelistEntry(there.uuid, assurance="tap"))
+    request = ProvisionRequest(order=BuildOrder(profile="load-cell"), whole_bus=True, sheet=file if sheet else None)
+    run = BatchRun(station, LinkSettings("can"), request, SilentReporter())
+    notices: list[str] = []
+    station.notice = notices.append
+    assert run._is_meant(contact(there)) == (said is None)
+    assert notices == ([] if said is None else [f"Skipped: node {there.uuid.hex()} {said}"])

@@ -152,7 +152,7 @@ class FileSink(ThreadedSink):
         return changed
 
     def _next_part(self) -> Part:
-        for number in range(1, PARTS):
+        for number in range(1, PARTS + 1):
             path = self._path if number == 1 else self._path.with_suffix(f".{number}{self._path.suffix}")
             try:
                 part = Part(path)

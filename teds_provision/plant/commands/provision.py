@@ -79,8 +79,13 @@ class LineOptions:
             line.scans = plant.line.Scans(sys.stdin, app.note)
             threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
         if found is not None and found.office not in (None, base.identity.fingerprint):
-            transport = plant.sign_requests.transport_for(base, self.files)
-            line.office = office = plant.sign_requests.RemoteOffice(base, transport, links.timeout)
+            office: plant.sign_requests.RemoteOffice | plant.sign_requests.JoinedOffice
+            if self.files is None:
+                office = plant.sign_requests.JoinedOffice(base, links.timeout)
+            else:
+                transport = plant.sign_requests.transport_for(base, self.files)
+                office = plant.sign_requests.RemoteOffice(base, transport, links.timeout)
+            line.office = office
             app.closing(office.close)
         return line
 

@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError, TedsProvisionError, UsageError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
-from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks import files, open_sink
 from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
 from teds_provision.measure.sinks.mcap.recover import recover
@@ -753,3 +753,14 @@ def test_a_part_goes_to_the_disk_once_a_second(tmp_path: Path, monkeypatch: pyte
         part.look(now)
     assert len(synced) == 3
     part.abandon()
+
+
+def test_a_recording_has_as_many_parts_as_its_error_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "PARTS", 3)
+    for name in ("run.csv", "run.2.csv", "run.3.csv"):
+        sink = open_sink(str(tmp_path / "run.csv"))
+        sink.open([ANGLE], STATION)
+        sink.close()
+        assert [Path(file).name for file in sink.files] == [name]
+    with pytest.raises(TedsProvisionError, match="There are 3 parts of"):
+        open_sink(str(tmp_path / "run.csv")).open([ANGLE], STATION)
