@@ -378,7 +378,7 @@ def _send(station: Station, roster: Roster, transport: Transport) -> int:
         try:
             transport.send(Parcel(row.id, row.peer, parcels.document(row.id, "out"), row.expires, station.fingerprint))
         except PolicyError:
-            break  # the receiver's queue is full: the rest goes with the next sync
+            break  # this station's room in the registry is full: the rest goes with the next sync
         with station.durable(_COMMAND):
             if row.kind == "bundle":
                 parcels.set_state(row.id, "out", "sent")

@@ -253,7 +253,8 @@ def test_detection_address_and_tokens(home: Path, running: Running) -> None:
          f"node joined: uuid {A}"),
         ({"event": "link", "state": "missing", "problem": {"message": "gone", "hint": "x"}, "count": 2},
          "link missing: problem gone, count 2"),
-        ({"event": "lines"}, "lines : "),
+        ({"event": "store", "state": "changed", "time": 5}, "store changed"),
+        ({"event": "lines", "count": 3}, "lines: count 3"),
     ],
 )  # fmt: skip
 def test_an_event_as_a_sentence(event: dict[str, Any], text: str) -> None:

@@ -257,7 +257,8 @@ def _sentence(event: dict[str, Any]) -> str:
         return ready if event.get("links") else f"{ready}\n{_NO_LINK}"
     facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
     text = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
-    return f"{event['event']} {event.get('state', '')}: {text}"
+    what = f"{event['event']} {event.get('state', '')}".rstrip()
+    return f"{what}: {text}" if text else what
 
 
 def _text(value: Any) -> str:
