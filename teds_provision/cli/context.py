@@ -55,8 +55,8 @@ __all__ = ["App", "Console", "RenderableType", "Station", "pass_app"]
 _BEHIND = " [y/N]: "
 _PRINTING = threading.Lock()
 SOCKET: Final = "ncap.sock"
-_SERVICE_SECONDS: Final = 5.0
 """``client.SOCKET``; that module is loaded only if the socket exists."""
+_SERVICE_SECONDS: Final = 5.0
 
 
 class App:
@@ -288,6 +288,12 @@ class App:
         station.use_agent = not self.has_passphrase
         station.released = self._released
         station.service_runs = self._service_runs
+        self.closing(station.close)
+        return station
+
+    def inspected(self) -> Station:
+        """Open the station of this home to look at it, also one whose init was not finished; raises StoreError."""
+        station = stations.Station.inspect(self.home, ask=self.ask_secret)
         self.closing(station.close)
         return station
 

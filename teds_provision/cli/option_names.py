@@ -8,18 +8,19 @@ from typing import Final
 # ruff: noqa: E501
 OPTIONS: Final[dict[str, frozenset[str]]] = {
     "": frozenset({"home", "json", "verbose", "quiet", "debug", "no-input", "passphrase-fd", "version"}),
-    "init": frozenset({"name", "keystore", "request", "certificate", "ca", "yes"}),
+    "init": frozenset({"name", "keystore", "request", "certificate", "ca", "yes", "dry-run"}),
     "provision": frozenset({"profile", "calibration", "item", "trust-dcc", "due", "no-calibration", "name", "accept-calibration", "retype", "adopt", "watch", "batch", "report", "all", "job", "calibrations", "files", "only", "label-to", "label-format", "scan", "evidence", "firmware", "firmware-key", "operator", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "verify": frozenset({"accept-calibration", "accept-firmware", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "nodes": frozenset({"state", "profile", "group", "due", "since", "fits", "format", "plant"}),
     "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "unsigned", "to", "wide", "file-units", "output", "ros1", "ros2", "mqtt", "foxglove", "foxglove-at", "no-scalars", "http-allow", "tls-cert", "tls-key", "actuators", "dead-man", "require", "require-firmware", "scalar-rate", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "trust add": frozenset({"from", "role", "fingerprint", "yes", "dry-run"}),
-    "trust ca drop": frozenset({"yes"}),
+    "trust ca drop": frozenset({"yes", "dry-run"}),
+    "trust ca import": frozenset({"dry-run"}),
     "trust ca sign": frozenset({"output", "yes", "dry-run"}),
     "trust remove": frozenset({"yes", "dry-run"}),
     "profile new": frozenset({"extends", "from", "message", "map", "output", "dry-run"}),
     "doctor": frozenset({"nfc", "can", "ble", "full", "report", "with-uuids"}),
-    "identify": frozenset({"watch", "add", "locate", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "identify": frozenset({"watch", "add", "locate", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "whitelist add": frozenset({"fingerprint", "name", "dry-run"}),
     "whitelist export": frozenset({"format", "dry-run"}),
     "whitelist import": frozenset({"format", "dry-run"}),
@@ -60,6 +61,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "names set": frozenset({"dry-run"}),
     "export-keys": frozenset({"to", "all", "mode", "output", "send", "expires", "ca", "yes", "dry-run"}),
     "import-keys": frozenset({"received", "prove", "receipt", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "handover receipt": frozenset({"dry-run"}),
     "handover undo": frozenset({"yes", "dry-run"}),
     "revoke": frozenset({"why", "lift", "yes", "dry-run"}),
     "decommission": frozenset({"force", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
@@ -98,6 +100,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "demo": frozenset({"page", "plant", "line", "http"}),
     "node check": frozenset({"factory", "explain", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "node create": frozenset({"uuid", "new-uuid", "name", "teds", "profile", "from", "message", "max-message", "firmware", "firmware-key"}),
+    "node reset": frozenset({"dry-run"}),
     "node run": frozenset({"nfc", "tag", "can", "ble", "source", "bus", "node-id", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }
 FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate", "csv", "dcc", "draft", "files", "firmware", "firmware-key", "home", "image", "key", "label-to", "laboratory", "list", "map", "member", "output", "pins", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "roster", "teds", "tls-cert", "tls-key", "trace", "trust-dcc"})

@@ -169,8 +169,10 @@ class CloseResult:
     fresh: bool
 
 
-def close(station: Station, octets: bytes) -> CloseResult:
+def close(station: Station, octets: bytes, *, dry_run: bool = False) -> CloseResult:
     """Take in the receipt of a bundle that left here; a move is then over: its keys are deleted.
+
+    ``dry_run`` returns and raises the same, and changes nothing.
 
     Only the keys that were in the bundle are deleted, and only while this very move is open: a receipt that comes after
     the node's return deletes nothing. A copy for several stations is closed when each has sent its receipt.
@@ -191,21 +193,24 @@ def close(station: Station, octets: bytes) -> CloseResult:
     if receipt.sender in map(signer_of, texts) or (row.state == CLOSED and row.mode == "move"):
         return CloseResult(row, receipt, fresh=False)
     if row.state == UNDONE:
-        station.audit("handover", None, "receipt of an undone move", handover=row.id)
+        if not dry_run:
+            station.audit("handover", None, "receipt of an undone move", handover=row.id)
         raise PolicyError(
             f"This move was undone here, but station {peer_name(station, receipt.sender)} took"
             f" {counted(len(receipt.imported), 'key')} in all the same.",
             hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move again.",
         )
+    texts.append(text)
+    state = CLOSED if len(texts) >= len(row.peers) else row.state
+    closed = replace(row, state=state, receipt="\n".join(texts))
+    if dry_run:
+        return CloseResult(closed, receipt, fresh=True)
     with station.transaction():
         _settle(station, row, receipt)
-        texts.append(text)
-        state = CLOSED if len(texts) >= len(row.peers) else row.state
-        row = replace(row, state=state, receipt="\n".join(texts))
-        station.handovers.put(row)
+        station.handovers.put(closed)
         detail = {"handover": row.id, "imported": len(receipt.imported), "refused": len(receipt.refused)}
         station.audit("handover", None, "receipt", state=state, **{"from": receipt.sender}, **detail)
-    return CloseResult(row, receipt, fresh=True)
+    return CloseResult(closed, receipt, fresh=True)
 
 
 def _settle(station: Station, row: Handover, receipt: Receipt) -> None:

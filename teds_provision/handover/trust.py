@@ -247,10 +247,18 @@ def drop_ca(station: Station) -> bool:
     return dropped
 
 
-def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
-    """Bring the CA key back; raises WrongPassphraseError, NotFoundError, VaultError, PolicyError (another CA's key)."""
+def require_own_ca(station: Station, path: Path, passphrase: str) -> None:
+    """Raise PolicyError unless the file holds this station's CA key.
+
+    Raises WrongPassphraseError, NotFoundError, VaultError.
+    """
     if SoftwareKey.from_secret(read_ca(path, passphrase)).point != station.ca:
         raise PolicyError(f"{path} contains a CA key other than this station's ({fingerprint(station.ca)[:16]}).")
+
+
+def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
+    """Bring the CA key back; raises WrongPassphraseError, NotFoundError, VaultError, PolicyError (another CA's key)."""
+    require_own_ca(station, path, passphrase)
     vault.import_ca(path, passphrase)
     station.audit("ca", None, "imported", ca=fingerprint(station.ca))
 

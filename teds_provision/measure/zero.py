@@ -41,8 +41,8 @@ from teds_provision.teds.units import format_value
 
 _NAME = "calibrate zero"
 _AFTERWARDS: Final = 16
-_ROUNDING: Final = 1e-6 * TURN
 """Samples by the new datasheet, one after the other: each takes 6 ms of a bus of 500 kbit/s."""
+_ROUNDING: Final = 1e-6 * TURN
 
 
 @dataclass(frozen=True)

@@ -284,21 +284,28 @@ def identify_at(
     add: bool = False,
     watch: bool = False,
     stop: threading.Event | None = None,
+    dry_run: bool = False,
 ) -> Iterator[Arrival[ProvenNode]]:
     """Identify the present node, or (``watch``) each that comes until ``stop``; ``add`` whitelists proven ones.
+
+    ``dry_run`` records nothing, and raises what ``add`` would raise.
 
     With ``watch`` an error ends one node only. Without it that is so if another node was identified, and it is reported
     as a notice; else the first error is raised.
     """
-    if add:
+    if add and not dry_run:
         station.unlock()  # before the wait for a node: the MAC of a pin needs the vault
+
+    def work(node: Conversation) -> ProvenNode:
+        return _identified(station, node, add=add, dry_run=dry_run)
+
     if watch:
-        yield from watch_nodes(links, lambda node: _identified(station, node, add), reporter, stop or threading.Event())
+        yield from watch_nodes(links, work, reporter, stop or threading.Event())
         return
     first: TedsProvisionError | None = None
     proven: list[tuple[Conversation, ProvenNode]] = []
     with meet_all(links, reporter) as nodes:
-        for node, found in _side_by_side(nodes, lambda node: _identified(station, node, add)):
+        for node, found in _side_by_side(nodes, work):
             if isinstance(found, ProvenNode):
                 proven.append((node, found))
                 continue
@@ -340,11 +347,13 @@ def _side_by_side(
         team.drop_waiting()
 
 
-def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
-    who = identify(station, node)
+def _identified(station: Station, node: Conversation, *, add: bool, dry_run: bool) -> ProvenNode:
+    who = examine(station, node) if dry_run else identify(station, node)
     described, firmware = describe(node), read_firmware(node, once=True)
     entry = who.whitelisted
-    if entry is None and add:
+    if entry is None and add and dry_run:
+        new_whitelist_entry(station, node, who)
+    elif entry is None and add:
         entry = add_to_whitelist(station, node, who)
     known = station.nodes.get(who.uuid)
     name = (known.name if known else None) or described.name
@@ -354,10 +363,11 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
         facts["channels"] = described.channels
         if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
             facts["name"] = name
-    with station.durable("identify"):
-        station.nodes.remember(who.uuid, **facts)
-        keep_firmware(station, who.uuid, firmware)
-        station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
+    if not dry_run:
+        with station.durable("identify"):
+            station.nodes.remember(who.uuid, **facts)
+            keep_firmware(station, who.uuid, firmware)
+            station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
     charging = node.contact.charging.to_json() if node.contact.charging else None
     ble = node.contact.ble.text if node.contact.ble else None
     runs = firmware_of(station, who.uuid, firmware)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from teds_provision.errors import UsageError, VaultChangedError, VaultError, WrongPassphraseError
 from teds_provision.lazy import late
@@ -21,6 +21,8 @@ else:  # a station uses only one of them, and argon2, keyring and python-pkcs11 
 
 _opened: dict[tuple[Path, str, str], Vault] = {}
 _Made = TypeVar("_Made")
+_FILE_EXISTS: Final = "the passphrase file already exists"
+_KEYRING_AVAILABLE: Final = "an OS keyring is available"
 
 
 class _QuestionNeededError(Exception):
@@ -91,6 +93,26 @@ def create_vault(
     return vault, why
 
 
+def plan_vault(home: Path, keystore: str | None) -> tuple[str, str]:
+    """Return the keystore that :func:`create_vault` would choose, and why; makes nothing and asks for nothing.
+
+    Raises KeyringUnavailableError, VaultError (a requested keyring that does not work), UsageError.
+    """
+    if keystore is not None:
+        if keystore == "keyring":
+            keyring_vault.inspect()
+        elif keystore != "file" and not keystore.startswith("pkcs11:"):
+            raise _unknown(keystore)
+        return keystore, "as requested"
+    if (home / file_vault.FILE_NAME).exists():
+        return "file", _FILE_EXISTS
+    try:
+        keyring_vault.inspect()
+    except VaultError as failure:
+        return "file", _no_keyring(failure)
+    return "keyring", _KEYRING_AVAILABLE
+
+
 def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool = False) -> Vault:
     """Open the vault of a station; a second call in one process returns the same vault, refreshed.
 
@@ -140,14 +162,13 @@ def _create(
         vault = file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored)
         return vault, "as requested"
     if keystore is not None:
-        raise UsageError(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
+        raise _unknown(keystore)
     if (home / file_vault.FILE_NAME).exists():
-        vault = file_vault.FileVault.create(home, store_id, ask, restored=restored)
-        return vault, "the passphrase file already exists"
+        return file_vault.FileVault.create(home, store_id, ask, restored=restored), _FILE_EXISTS
     try:
-        return keyring_vault.KeyringVault.create(store_id, restored=restored), "an OS keyring is available"
+        return keyring_vault.KeyringVault.create(store_id, restored=restored), _KEYRING_AVAILABLE
     except VaultError as failure:
-        why = f"no OS keyring: {failure.message[:1].lower()}{failure.message[1:].rstrip('.')}"
+        why = _no_keyring(failure)
     return file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
 
 
@@ -165,7 +186,15 @@ def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool
                 agent.lock(home)
                 raise
         return pkcs11.Pkcs11Vault.open(home, store_id, keystore, ask)
-    raise UsageError(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
+    raise _unknown(keystore)
+
+
+def _unknown(keystore: str) -> UsageError:
+    return UsageError(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
+
+
+def _no_keyring(failure: VaultError) -> str:
+    return f"no OS keyring: {failure.message[:1].lower()}{failure.message[1:].rstrip('.')}"
 
 
 def _holding(pin: bytes, ask: Ask) -> Ask:

@@ -10,11 +10,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
 
 from teds_provision import __version__
+from teds_provision.cli.main import cli
 from teds_provision.cli.table import COMMANDS, GROUPS
 from tests.bench import PASSPHRASE
 from tests.terminal import on_terminal
@@ -78,6 +81,37 @@ def test_no_option_can_hold_a_secret(tmp_path: Path, name: str) -> None:
     options = re.findall(r"--([a-z-]+)", call(tmp_path, name, "--help").out)
     secret = {option for option in options if re.search("pass|pin$|secret|token", option)}
     assert secret <= {"passphrase-fd", "backup-passphrase-fd"}
+
+
+NO_PLAN = frozenset(
+    re.findall(
+        r"\S+",
+        "verify nodes measure completion doctor draft-list history read locate label log trace-show show "
+        "describe sample set mode unlock lock demo trust-list trust-ca-create trust-ca-export profile-list "
+        "profile-show profile-check config-path config-show config-set config-unset whitelist-list "
+        "record-info record-show record-convert calibrate-capture calibrate-fit ncap-run ncap-status "
+        "ncap-measure ncap-detection ncap-open ncap-token-add ncap-token-list ncap-token-remove group-list "
+        "names-list handover-list node-create node-run node-check registry-request registry-sync "
+        "registry-status registry-log registry-seen registry-sql job-list job-show job-status signer-run "
+        "signer-once evidence-verify evidence-list ",
+    )
+)
+"""Commands that show, write files, run until they are ended, or talk to a running service."""
+
+
+def commands(name: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
+    if not isinstance(command, click.Group):
+        yield name, command
+    for word, inner in command.commands.items() if isinstance(command, click.Group) else ():
+        yield from commands(f"{name}-{word}", inner)
+
+
+def test_every_command_that_changes_something_takes_dry_run() -> None:
+    context = click.Context(cli)
+    every = [pair for name in PRESENT if (top := cli.get_command(context, name)) for pair in commands(name, top)]
+    with_plan = {name for name, command in every if any("--dry-run" in option.opts for option in command.params)}
+    assert {name for name, _ in every} - with_plan <= NO_PLAN
+    assert {"init", "identify", "trust-ca-drop", "handover-receipt", "whitelist-import", "node-reset"} <= with_plan
 
 
 def test_a_mistyped_command_is_usage_with_the_nearest_one(tmp_path: Path) -> None:

@@ -113,10 +113,25 @@ def test_a_move_and_its_receipt_lost_and_found(homes: Homes) -> None:
     assert receipt.read_bytes() == first
     (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
     assert (row["state"], row["mode"], row["names"]) == ("open", "move", ["south"])
+    before = homes.state(homes.north)
+    plan = homes.run(homes.north, "handover", "receipt", receipt, "--dry-run").json
+    assert (plan["plan"], plan["state"], plan["fresh"], plan["imported"]) == (True, "closed", True, UUIDS)
+    shown = call(homes.north, "handover", "receipt", receipt, "--dry-run").out
+    assert shown == "Plan, nothing is changed:\nStation south imported 2 nodes; their keys would be deleted here.\n"
+    assert homes.state(homes.north) == before
     for fresh in (True, False):
         assert homes.run(homes.north, "handover", "receipt", receipt).json["fresh"] is fresh
     (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
     assert row["state"] == "closed"
+
+
+def test_the_plan_of_a_receipt_whose_move_was_undone_is_refused_and_leaves_no_entry(homes: Homes) -> None:
+    path = homes.export("--all", "--mode", "move")
+    receipt = Path(homes.run(homes.south, "import-keys", path, "--yes").json["receipt"])
+    (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
+    assert homes.run(homes.north, "handover", "undo", row["id"], "--yes").code == 0
+    error = homes.refused(6, "handover", "receipt", receipt, "--dry-run", home=homes.north)
+    assert error["message"].startswith("This move was undone here, but station south took 2 keys in all the same.")
 
 
 def test_an_export_again_finds_nothing_to_do(homes: Homes) -> None:

@@ -77,6 +77,32 @@ def test_a_keyring_that_may_not_hold_a_secret_is_never_used(tmp_path: Path, back
     assert (chosen.code, chosen.json["keystore"]) == (0, "file")
 
 
+def test_a_plan_of_init_makes_nothing_and_asks_for_nothing(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    plan = init(home, "--dry-run", "--name", "bench", passphrase=None)
+    why = "no OS keyring: this machine has no keyring that is suitable for secrets"
+    assert (plan.code, plan.json) == (
+        0,
+        {"plan": True, "name": "bench", "home": str(home), "keystore": "file", "why": why},
+    )
+    assert init(home, "--dry-run", "--keystore", "file", passphrase=None).json["why"] == "as requested"
+    assert init(home, "--dry-run", "--keystore", "keyring", passphrase=None).code == 7
+    assert init(home, "--dry-run", "--keystore", "vault", passphrase=None).code == 2
+    request = tmp_path / "lab.request"
+    words = ("--keystore", "file", "--request", str(request), "--dry-run")
+    shown = spawn("--home", home, "init", *words, passphrase=None).out
+    what = f"create the station's key, and write a certificate request to {request}"
+    assert shown == f"Plan: {what}, in the file keystore (as requested), home {home}.\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_of_a_second_init_shows_the_station(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    report = init(home, "--keystore", "file", "--name", "bench").json
+    assert init(home, "--dry-run", passphrase=None).json == report | {"plan": True}
+    assert init(home, "--dry-run", "--name", "other", passphrase=None).code == 2
+
+
 def test_an_asked_for_keyring_that_is_not_there_is_exit_7_and_leaves_no_station(tmp_path: Path) -> None:
     home = tmp_path / "home"
     assert init(home, "--keystore", "keyring").code == 7

@@ -103,8 +103,13 @@ def test_the_ca_key_away_and_back(home: Path, tmp_path: Path) -> None:
     assert b"ENCRYPTED" in path.read_bytes()
     assert unlocked(home, "trust", "ca", "export", path).code == 7
     assert unlocked(home, "trust", "ca", "drop").code == 6
+    assert unlocked(home, "trust", "ca", "drop", "--dry-run").json == {"dropped": True, "plan": True}
+    assert unlocked(home, "trust", "ca", "create").code == 0, "a plan drops nothing"
     assert [unlocked(home, "trust", "ca", "drop", "--yes").json["dropped"] for _ in range(2)] == [True, False]
-    assert unlocked(home, "trust", "ca", "create").code == 6
+    assert unlocked(home, "trust", "ca", "drop", "--dry-run").json == {"dropped": False, "plan": True}
+    plan = unlocked(home, "trust", "ca", "import", path, "--dry-run")
+    assert plan.json == {"fingerprint": shown, "plan": True}
+    assert unlocked(home, "trust", "ca", "create").code == 6, "a plan imports nothing"
     assert unlocked(home, "trust", "ca", "import", path).json["fingerprint"] == shown
     assert unlocked(home, "trust", "ca", "create").code == 0
 

@@ -46,6 +46,13 @@ def test_a_dry_run_on_a_new_node_changes_nothing(station: Station, node: Node, t
     station.ask("whitelist", "import", file, "--dry-run")
     station.ask("whitelist", "export", tmp_path / "out.xml", "--dry-run")
     assert not (tmp_path / "out.xml").exists()
+    found = station.ask("identify", "--add", "--dry-run", *links.over("nfc"))
+    assert (found["uuid"], found["whitelisted"], found["plan"]) == (node.uuid, False, ["whitelist"])
+    assert station.ask("identify", "--dry-run", *links.over("can"))["plan"] == []
+    assert "would be whitelisted" in station.run("identify", "--add", "--dry-run", *links.over("nfc")).out
+    assert everything(station, node) == before
+    node.stop()
+    assert station.ask("node", "reset", node.folder, "--dry-run") == {"uuid": node.uuid, "plan": "reset"}
     assert everything(station, node) == before
 
 

@@ -29,16 +29,17 @@ from teds_provision.station.store.records import utc_now
 @click.option("--watch", is_flag=True, help="Keep watching: one line per node.")
 @click.option("--add", is_flag=True, help="Whitelist nodes that prove their key.")
 @click.option("--locate", "locating", is_flag=True, help="Make each board blink in turn, and ask for its name.")
+@dry_run_option
 @link_options
 @pass_app
-def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bool) -> None:
+def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bool, dry_run: bool) -> None:
     """Wait for a tap, read the node's UUID and key, and have it prove that it holds the key.
 
     With --via can, every node on the bus is asked; --json lists several under "nodes". A board whose button is pressed
     meanwhile says so.
     """
     if locating:
-        _require_a_person(app, watch)
+        _require_a_person(app, watch, dry_run)
     stop = provisioning.meeting.IdleStop(None)
     if watch:
         signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
@@ -46,12 +47,18 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bo
     found: list[dict[str, Any]] = []
     reporter = reporter_for(app, several=several)
     for arrival in provisioning.identify.identify_at(
-        app.station(), links, PressLines(app, reporter) if watch else reporter, add=add, watch=watch, stop=stop
+        app.station(),
+        links,
+        PressLines(app, reporter) if watch else reporter,
+        add=add,
+        watch=watch,
+        stop=stop,
+        dry_run=dry_run,
     ):
         if arrival.error is not None:
             app.fail_line(arrival.error, uuid=arrival.uuid.hex(), time=arrival.time)
         elif arrival.result is not None:
-            found.append(_to_json(arrival.result))
+            found.append(_to_json(arrival.result) | (_plan(arrival.result, add=add) if dry_run else {}))
             if watch:
                 _emit(app, found.pop() | {"time": arrival.time})
     if locating:
@@ -107,12 +114,17 @@ def _to_json(found: provisioning.identify.ProvenNode) -> dict[str, Any]:
     }
 
 
+def _plan(found: provisioning.identify.ProvenNode, *, add: bool) -> dict[str, Any]:
+    return {"plan": ["whitelist"] if add and not found.whitelisted else []}
+
+
 def _emit(app: App, found: dict[str, Any]) -> None:
     app.emit(found, "\n".join(map(_line, found.get("nodes", [found]))))
 
 
 def _line(found: dict[str, Any]) -> str:
     listed = "whitelisted" if found["whitelisted"] else "not whitelisted"
+    listed = "would be whitelisted" if found.get("plan") else listed
     name = f"  {found['name']}" if found["name"] else ""
     tag = f"  tag {found['tag_uid']}" if found["tag_uid"] else ""
     charge = f"  {found['charging']['text']}" if found["charging"] else ""
@@ -160,7 +172,9 @@ def locate(app: App, uuid: str, seconds: int, links: LinkSettings) -> None:
     )
 
 
-def _require_a_person(app: App, watch: bool) -> None:
+def _require_a_person(app: App, watch: bool, dry_run: bool) -> None:
+    if dry_run:
+        raise UsageError("--locate makes boards blink, so it cannot be combined with --dry-run.")
     if watch:
         raise UsageError("--locate takes the boards that are there now, so it cannot be combined with --watch.")
     if not app.interactive:

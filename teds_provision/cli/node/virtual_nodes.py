@@ -20,7 +20,15 @@ from teds_provision import node as node_room
 from teds_provision import provisioning, teds
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import SOCKET, App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    FileToRead,
+    Number,
+    WholeNumber,
+    command,
+    dry_run_option,
+    examples,
+)
 from teds_provision.errors import KnownUuidError, StoreError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
 from teds_provision.node.flash_file import FlashFile
@@ -253,12 +261,16 @@ def _known_as(app: App, uuid: bytes) -> str | None:
     epilog=examples("teds-provision node reset bench/finger"),
 )
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@dry_run_option
 @pass_app
-def reset(app: App, folder: Path) -> None:
+def reset(app: App, folder: Path, *, dry_run: bool) -> None:
     """Reset the node in DIR by hand (button held for 5 s) while it is not running."""
     node = node_room.virtual.VirtualNode(folder, exclusive=True)
-    node.reset_by_hand()
     uuid = node.tim.flash.uuid.hex()
+    if dry_run:
+        app.emit({"uuid": uuid, "plan": "reset"}, f"Plan: reset node {uuid} to factory state.")
+        return
+    node.reset_by_hand()
     app.emit({"uuid": uuid, "state": "factory"}, f"Node {uuid} is back in factory state.")
 
 

@@ -489,8 +489,9 @@ def list_(app: App) -> None:
     epilog=examples("teds-provision handover receipt lab.jwe.receipt"),
 )
 @click.argument("file", type=click.Path(path_type=Path))
+@dry_run_option
 @pass_app
-def receipt(app: App, file: Path) -> None:
+def receipt(app: App, file: Path, *, dry_run: bool) -> None:
     """Complete a handover with the receiver's signed receipt; after a move, the keys are then deleted here.
 
     FILE may be a directory: every *.receipt in it is used.
@@ -500,14 +501,17 @@ def receipt(app: App, file: Path) -> None:
     if not files:
         raise NotFoundError(f"There is no receipt (*.receipt) in {file}.")
     with station.lock("handover receipt", app.note):
-        closed, failed = _close_all(app, station, files, go_on=file.is_dir())
+        closed, failed = _close_all(app, station, files, go_on=file.is_dir(), dry_run=dry_run)
     results = [_closed(result) for result in closed]
-    text = "\n".join(_closed_text(station, result) for result in closed)
-    app.conclude({**results[0], "receipts": results} if results else {"receipts": []}, text or None, failed)
+    lines = ["Plan, nothing is changed:"] if dry_run and closed else []
+    lines += [_closed_text(station, result, dry_run=dry_run) for result in closed]
+    plan = {"plan": True} if dry_run else {}
+    result = {**results[0], "receipts": results} if results else {"receipts": []}
+    app.conclude(result | plan, "\n".join(lines) or None, failed)
 
 
 def _close_all(
-    app: App, station: Station, files: list[Path], *, go_on: bool
+    app: App, station: Station, files: list[Path], *, go_on: bool, dry_run: bool
 ) -> tuple[list[CloseResult], TedsProvisionError | None]:
     """Close by each receipt; return what was closed, and the first error if one does not end all (``go_on``)."""
     closed: list[CloseResult] = []
@@ -515,7 +519,7 @@ def _close_all(
     for path in files:
         try:
             octets = read_limited(path, MAX_RECEIPT_OCTETS, "receipt")
-            closed.append(close(station, octets))
+            closed.append(close(station, octets, dry_run=dry_run))
         except TedsProvisionError as error:
             if not go_on and error.message == NO_COMPACT_JWS:
                 raise BadDataError(f"{path} is not a receipt.", hint="Use the file that import-keys wrote.") from error
@@ -538,15 +542,15 @@ def _closed(done: CloseResult) -> dict[str, Any]:
     }
 
 
-def _closed_text(station: Station, done: CloseResult) -> str:
+def _closed_text(station: Station, done: CloseResult, *, dry_run: bool) -> str:
     imported, refused = done.receipt.imported, done.receipt.refused
     text = f"Station {peer_name(station, done.receipt.sender)} imported {count_of(len(imported))}"
-    text += (
-        ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (already known)."
-    )
+    deleted = f"; their keys {'would be' if dry_run else 'are'} deleted here." if done.row.mode == "move" else "."
+    text += deleted if done.fresh else " (already known)."
     lines = [f"  refused {node.uuid.hex()}: {node.why}" for node in refused]
     if refused and done.row.mode == "move":
-        lines.append("The refused nodes belong to this station again; their keys are rotated at the next contact.")
+        again = "would belong" if dry_run else "belong"
+        lines.append(f"The refused nodes {again} to this station again; their keys are rotated at the next contact.")
     return "\n".join([text, *lines])
 
 

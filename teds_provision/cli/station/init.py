@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import FileToRead, command, yes_option
+from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.files import read_limited, require_new, write_new
 from teds_provision.lazy import late
 from teds_provision.protocol.keys import fingerprint, to_pem
 from teds_provision.station.station import Station, initialise
-from teds_provision.vault import agent
+from teds_provision.station.store.sqlite import has_store
+from teds_provision.vault import agent, selection
 
 if TYPE_CHECKING:
     from teds_provision.handover import trust
+    from teds_provision.handover.trust import Certificate
 else:  # bundles and receipts: only for the CA of another station
     trust = late("teds_provision.handover.trust")
 
@@ -52,6 +54,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     help='Use the owner\'s CA key from this file of "trust ca export" instead of creating one.',
 )
 @yes_option
+@dry_run_option
 @pass_app
 def init(
     app: App,
@@ -61,6 +64,7 @@ def init(
     certificate: Path | None,
     ca_file: Path | None,
     yes: bool,
+    dry_run: bool,
 ) -> None:
     """Create this base station's identity and CA key; a second run shows them.
 
@@ -72,6 +76,9 @@ def init(
         raise click.UsageError("Use --ca alone: the key in its file certifies this station at once.")
     if request is not None and certificate is not None:
         raise click.UsageError("Use --request first, then --certificate once the CA has signed it.")
+    if dry_run:
+        _plan(app, name, keystore, request=request, certificate=certificate, ca_file=ca_file)
+        return
     if request is not None:
         _request(app, name, keystore, request)
         return
@@ -90,18 +97,58 @@ def init(
         _require_same(station, name, keystore)
     ca = fingerprint(station.ca)
     app.emit(
-        {
-            "name": station.name,
-            "public_key": to_pem(station.point),
-            "fingerprint": station.fingerprint,
-            "ca": {"public_key": to_pem(station.ca), "fingerprint": ca},
-            "keystore": station.identity.keystore,
-            "why": why,
-        },
+        _to_json(station, why),
         f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
         f"  keystore {station.identity.keystore} ({why}){_open_for(app)}\n  home     {app.home}\n\n"
         f"{to_pem(station.point)}",
     )
+
+
+def _to_json(station: Station, why: str) -> dict[str, Any]:
+    return {
+        "name": station.name,
+        "public_key": to_pem(station.point),
+        "fingerprint": station.fingerprint,
+        "ca": {"public_key": to_pem(station.ca), "fingerprint": fingerprint(station.ca)},
+        "keystore": station.identity.keystore,
+        "why": why,
+    }
+
+
+def _plan(
+    app: App,
+    name: str | None,
+    keystore: str | None,
+    *,
+    request: Path | None,
+    certificate: Path | None,
+    ca_file: Path | None,
+) -> None:
+    """Print what init would do, without a key, a passphrase or a folder."""
+    if has_store(app.home):
+        station = app.inspected()
+        if station.identity.is_complete() and request is None and certificate is None and ca_file is None:
+            _require_same(station, name, keystore)
+            why = station.identity.keystore_why
+            app.emit(_to_json(station, why) | {"plan": True}, f"Nothing to do: station {station.name} exists.")
+            return
+    result: dict[str, Any] = {"plan": True, "name": name, "home": str(app.home)}
+    if certificate is not None:
+        ca = _read_certificate(certificate).ca
+        text = f"trust the CA {fingerprint(ca)[:32]}, which issued {certificate}"
+        app.emit(result | {"ca": {"public_key": to_pem(ca), "fingerprint": fingerprint(ca)}}, f"Plan: {text}.")
+        return
+    kind, why = selection.plan_vault(app.home, keystore)
+    if request is not None:
+        if not request.exists():
+            require_new(request)
+        what = f"create the station's key, and write a certificate request to {request}"
+    elif ca_file is not None:
+        what = f"create the station's key, certified by the CA key of {ca_file}"
+    else:
+        what = "create the station's key and a CA key"
+    text = f"Plan: {what}, in the {kind.partition(':')[0]} keystore ({why}), home {app.home}."
+    app.emit(result | {"keystore": kind, "why": why}, text)
 
 
 def _open_for(app: App) -> str:
@@ -153,8 +200,12 @@ def _is_request_of(path: Path, point: bytes) -> bool:
         return False
 
 
+def _read_certificate(path: Path) -> Certificate:
+    return trust.read_certificate(read_limited(path, trust.MAX_OCTETS, "certificate"))
+
+
 def _adopt(app: App, path: Path, yes: bool) -> None:
-    certificate = trust.read_certificate(read_limited(path, trust.MAX_OCTETS, "certificate"))
+    certificate = _read_certificate(path)
     digits = fingerprint(certificate.ca)
     app.note(f"The CA that issued this certificate; compare by voice:\n  {trust.spoken(digits)}")
     app.confirm("Trust this CA as the owner of this station's nodes?", yes=yes)

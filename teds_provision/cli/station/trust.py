@@ -32,6 +32,7 @@ from teds_provision.handover.trust import (
     plan_removal,
     read_request,
     require_ca,
+    require_own_ca,
     sign_request,
     spoken,
     write_certificate,
@@ -333,11 +334,17 @@ def export(app: App, file: Path) -> None:
 
 @ca.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca drop --yes"))
 @yes_option
+@dry_run_option
 @pass_app
-def drop(app: App, yes: bool) -> None:
+def drop(app: App, yes: bool, dry_run: bool) -> None:
     """Permanently remove the CA key from the vault. Export it first: no station can be certified without it."""
     station = app.station()
     station.unlock()
+    if dry_run:
+        present = station.vault.ca() is not None
+        text = "Plan: remove the CA key from this vault." if present else "Nothing to do."
+        app.emit({"dropped": present, "plan": True}, text)
+        return
     app.confirm("Delete the CA key from this vault? You can only restore it from its exported file.", yes=yes)
     with station.lock("trust ca drop", app.note):
         dropped = drop_ca(station)
@@ -346,13 +353,18 @@ def drop(app: App, yes: bool) -> None:
 
 @ca.command("import", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca import owner-ca.pem"))
 @click.argument("file", type=FileToRead())
+@dry_run_option
 @pass_app
-def import_(app: App, file: Path) -> None:
+def import_(app: App, file: Path, *, dry_run: bool) -> None:
     """Import the CA key from a file written by "trust ca export"."""
     station = app.station()
     vault = station.vault
     passphrase = app.ask_secret("Passphrase of the CA key's file")
+    digits = protocol_keys.fingerprint(station.ca)
+    if dry_run:
+        require_own_ca(station, file, passphrase)
+        app.emit({"fingerprint": digits, "plan": True}, f"Plan: import the CA key {digits[:16]} into this vault.")
+        return
     with station.lock("trust ca import", app.note):
         import_ca(station, vault, file, passphrase)
-    digits = protocol_keys.fingerprint(station.ca)
     app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is now in this vault.")
