@@ -81,6 +81,15 @@ def test_an_open_is_good_once_and_counts() -> None:
     assert int.from_bytes(after, "big") == int.from_bytes(before, "big") + 1
 
 
+def test_the_nodes_one_time_keys_are_each_for_one_open_or_one_request() -> None:
+    desk = Desk().agree()
+    points = [desk.plain(opening(desk)[1]).payload[:65] for _ in range(2)]
+    points += [desk.plain(StationAgreement(CREDENTIALS, UUID).request()).payload[20:85] for _ in range(2)]
+    points.append(desk.plain(opening(desk)[1]).payload[:65])
+    assert [point[0] for point in points] == [4] * 5
+    assert len(set(points)) == 5
+
+
 def test_a_recorded_reply_is_not_taken_for_the_reply_to_a_later_command() -> None:
     """Its tag is right, under the counter that it names: only that it is not the one asked for tells."""
     desk = Desk().agree().open()
@@ -191,6 +200,7 @@ def test_a_padding_that_is_none_is_a_wrong_tag_and_uses_up_no_counter() -> None:
     frame = IDENTIFY.encode()
     wrong = [frame + bytes(10), frame + bytes(9) + b"\x0a", frame + b"\x0a" * 9 + b"\x0b", frame + b"\x11" * 26]
     wrong += [frame + b"\xff" * 10, frame + b"\x09" + b"\x0a" * 9 + b"\x20" * 16]
+    wrong += [frame + bytes(10) + b"\x0f" + b"\x10" * 15]
     for blocks in wrong:
         assert len(blocks) % 16 == 0
         assert desk.plain(session.seal_padded(blocks)) == refusal(Reason.BAD_TAG), blocks.hex()

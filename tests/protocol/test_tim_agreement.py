@@ -250,6 +250,8 @@ def test_the_station_checks_length_point_tag_proof_and_epoch_in_this_order() -> 
     everything = with_en(bent(bent(answered.reply(signer=CA), TAG_AT), 19), OFF_CURVE)
     with pytest.raises(GarbledError, match="164 octets, not 165"):
         answered.accept(everything[:-1], epoch=1)
+    with pytest.raises(GarbledError, match="166 octets, not 165"):
+        answered.accept(everything + b"\0", epoch=1)
     with pytest.raises(NotAuthenticError, match="one-time key"):
         answered.accept(everything, epoch=1)
     with pytest.raises(TranscriptMismatchError):

@@ -62,6 +62,18 @@ def test_query_of_an_absent_teds_says_not_available() -> None:
     assert found.max_size > 0
 
 
+def test_a_node_may_hold_codes_1_to_17_and_128_to_135_on_channels_0_to_255() -> None:
+    """The whole reply of Query to each that is absent: NotAvail, what it would be, no size, no checksum."""
+    desk = Desk()
+    rest = "0000000000000000004000"
+    for code in (1, *range(3, 18), *range(129, 136)):
+        shown = 0x42 if code >= 128 else 0x12 if code in (2, 4, 6, 10, 11, 14, 15) else 0x02
+        for channel in (0, 1, 255):
+            found = desk.plain(query_teds(channel, code))
+            assert (found.ok, found.payload.hex()) == (True, f"{shown:02x}{rest}"), (channel, code)
+    assert desk.plain(query_teds(255, 128)).payload.hex() == f"42{rest}", "128 may lie on any channel"
+
+
 def test_query_of_the_security_teds_says_it_is_the_manufacturers() -> None:
     found = status(Desk(), 0, 128)
     assert found.attributes == Attribute.MANUFACTURER
@@ -163,6 +175,21 @@ def test_the_17_of_the_staging_area_comes_after_4_3_and_18_and_before_10() -> No
     assert two.by_can(write_teds(0, 127, 0, b"x")) == refusal(Reason.NO_SUCH_TEDS)
     assert two.by_can(update_teds(0, 127)) == refusal(Reason.NO_SUCH_TEDS)
     assert two.by_can(write_teds(1, 12, 0, bytes(1900))) == BUSY
+
+
+def test_a_write_of_too_much_gets_17_while_another_session_has_staged_and_10_then() -> None:
+    desk = Desk().agree()
+    desk.tim = Tim(NODE, desk.memory, lambda: desk.now, max_message=2048, max_teds=500)
+    here, there = desk.open().session, desk.open(link="can:f1").session
+    assert here is not None
+    assert there is not None
+    two = TwoSessions(desk, here, there)
+    assert two.by_nfc(write_teds(1, 12, 0, bytes(500))).ok
+    assert two.by_nfc(write_teds(1, 12, 500, b"x")) == refusal(Reason.TOO_LARGE)
+    assert two.by_can(write_teds(1, 12, 0, bytes(501))) == BUSY
+    desk.now += 60
+    assert two.by_can(write_teds(1, 12, 0, bytes(501))) == refusal(Reason.TOO_LARGE)
+    assert two.by_nfc(write_teds(1, 12, 500, b"")).ok, "the refusal made nothing give way"
 
 
 @pytest.mark.parametrize(("seconds", "reply"), [(59.9, BUSY), (60.0, Reply(True))])
@@ -348,11 +375,38 @@ def test_every_refusal_of_the_commit(desk: Desk) -> None:
     assert desk.commit(BLOCKS, desk.signed(BLOCKS, sequence=65536)).ok
 
 
+def test_of_two_faults_of_a_commit_the_first_check_names_its_own(desk: Desk) -> None:
+    foreign = frame(bytes.fromhex("030400010101040a") + bytes(10) + bytes.fromhex("0a043f8000000c043f0000000d020001"))
+    of_another = {(0, 1): foreign, (1, 12): NAME}
+    stale = {"sequence": 0, "key_epoch": 2}
+    other_digest = desk.signed({**of_another, (1, 12): NAME + b"x"}, **stale)
+    other_key = replace(security.decode(other_digest), node_key_signature=bytes(64)).encode()
+    other_value = replace(security.decode(other_key), values={**security.OUR_VALUES, 4: 0}).encode()
+    assert desk.commit({(0, 1): foreign, (1, 12): NAME + b"x"}, other_key).reason == 4
+    assert desk.commit(of_another, other_value).reason == 4
+    assert desk.commit(of_another, other_key).reason == 5
+    assert desk.commit(of_another, other_digest).reason == 6
+    assert desk.commit(of_another, desk.signed(of_another, **stale)).reason == 9
+    assert desk.commit(BLOCKS, desk.signed(BLOCKS, **stale)).reason == 7
+    assert desk.commit(BLOCKS, desk.signed(BLOCKS, key_epoch=2)).reason == 8
+    assert desk.commit(BLOCKS).ok
+
+
 def test_a_meta_teds_of_another_node_gets_9_but_a_2024_uuid_is_not_compared(desk: Desk) -> None:
     foreign = frame(bytes.fromhex("030400010101040a") + bytes(10) + bytes.fromhex("0a043f8000000c043f0000000d020001"))
     assert desk.commit({(0, 1): foreign}) == refusal(Reason.WRONG_UUID)
     new_form = frame(bytes.fromhex("030500ff0102010410") + bytes(16))
     assert desk.commit({(0, 1): new_form}).ok
+    nameless = frame(bytes.fromhex("0304000101010a043f8000000c043f0000000d020001"))
+    assert desk.commit({(0, 1): nameless}) == refusal(Reason.WRONG_UUID), "field 4 is due"
+    assert desk.commit({(0, 1): META, (1, 1): foreign}) == refusal(Reason.WRONG_UUID), "on whatever channel"
+
+
+def test_a_read_only_meta_teds_of_another_node_gets_9_too() -> None:
+    foreign = frame(bytes.fromhex("030400010101040a") + bytes(10) + bytes.fromhex("0a043f8000000c043f0000000d020001"))
+    desk = Desk(blocks={(0, 1): foreign}, read_only=frozenset({(0, 1)})).agree().open()
+    desk.stage(SECURITY, desk.signed({(0, 1): foreign}))
+    assert desk.sealed(update_teds(0, 128)) == refusal(Reason.WRONG_UUID)
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,16 @@ def test_a_frame_whose_length_lies_gets_4(octets: bytes) -> None:
     assert Desk().raw(octets) == refusal(Reason.BAD_FORM)
 
 
+def test_a_length_that_lies_gets_4_even_where_the_command_would_take_what_came() -> None:
+    desk = Desk().agree()
+    session = StationSession(desk.key, UUID)
+    opening = session.open(desk.plain(COMMANDS["counter of open"]).payload).encode()
+    assert opening[4:6] == b"\0\x59"
+    for length in (b"\0\0", b"\0\x58", b"\0\x5a", b"\1\x59"):
+        assert desk.raw(opening[:4] + length + opening[6:]) == refusal(Reason.BAD_FORM)
+    assert desk.raw(opening).ok
+
+
 def test_identify_says_what_is_so() -> None:
     desk = Desk()
     assert Identity.decode(desk.plain(COMMANDS["identify"]).payload) == Identity(
@@ -197,6 +207,7 @@ def test_the_address_that_is_in_flash_is_not_written_again_and_a_claim_is_undone
     desk.memory.fail = True  # a write would be refused with 11
     assert desk.plain(address(0x21)).ok
     desk.tim.take_can_address(0x40)
+    assert Identity.decode(desk.plain(COMMANDS["identify"]).payload).can_address == 0x40, "the present one"
     assert desk.plain(address(0x21)).ok
     assert desk.tim.can_address == 0x21
     desk.memory.fail = False
