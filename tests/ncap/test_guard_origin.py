@@ -153,3 +153,106 @@ def test_a_token_that_has_expired_is_not_listed(tmp_path: Path, monkeypatch: pyt
     later = time.time() + 31 * 86_400
     monkeypatch.setattr(time, "time", lambda: later)
     assert [token.name for token in tokens.all()] == ["script"]
+
+
+def asked(guard: Guard, path: str, headers: dict[str, str], query: bytes = b"") -> tuple[int, dict[str, list[str]]]:
+    """Return the status and the headers of one GET."""
+    sent: list[Message] = []
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    none: Any = None
+    pairs = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "http", "method": "GET", "path": path, "query_string": query, "headers": pairs}
+    asyncio.run(guard(scope, none, send))
+    found: dict[str, list[str]] = {}
+    for name, value in sent[0]["headers"]:
+        found.setdefault(name.decode(), []).append(value.decode())
+    return int(sent[0]["status"]), found
+
+
+def test_every_answer_has_these_headers(tmp_path: Path) -> None:
+    csp = (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+        "font-src 'self'; manifest-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+    )
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    good = {"host": HERE, "authorization": f"Bearer {tokens.add('script')}"}
+    for headers, status in ((good, 200), ({"host": HERE}, 401), ({"host": "evil.example"}, 421)):
+        found = asked(guard, "/api/v1/status", headers)
+        assert found[0] == status
+        assert {name: values for name, values in found[1].items() if not name.startswith("content-")} == {
+            "x-content-type-options": ["nosniff"],
+            "x-frame-options": ["DENY"],
+            "referrer-policy": ["no-referrer"],
+            "cross-origin-resource-policy": ["same-origin"],
+            "cross-origin-opener-policy": ["same-origin"],
+            "cache-control": ["no-store"],
+        }
+        assert found[1]["content-security-policy"] == [csp]
+
+
+@pytest.mark.parametrize(("tls", "more"), [(False, ""), (True, "; Secure")])
+def test_the_cookie_of_a_browser_is_for_this_site_alone_and_with_tls_for_tls_alone(
+    tmp_path: Path, tls: bool, more: str
+) -> None:
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=tls))
+    status, headers = asked(guard, "/login", {"host": HERE}, f"token={tokens.login_link()}".encode())
+    (cookie,) = headers["set-cookie"]
+    value = cookie.partition(";")[0].removeprefix(f"ncap-{PORT}=")
+    assert (status, headers["location"]) == (303, ["/"])
+    assert cookie == f"ncap-{PORT}={value}; HttpOnly; SameSite=Strict; Path=/; Max-Age=2592000{more}"
+    found = tokens.find(value)
+    assert found is not None
+    assert found.kind == "browser"
+
+
+@pytest.mark.parametrize(
+    ("tls", "port", "host", "status"),
+    [
+        (False, 80, "localhost", 200),
+        (False, 443, "localhost", 421),
+        (True, 443, "localhost", 200),
+        (True, 80, "localhost", 421),
+        (True, 443, "arm.example", 200),
+        (True, 8451, "arm.example:8451", 200),
+        (True, 8451, "arm.example", 421),
+        (True, 8451, "[fd00::7]:8451", 200),
+        (True, 8451, "[::1]:8451", 200),
+        (True, 8451, "other.example:8451", 421),
+    ],
+)
+def test_a_host_is_named_with_its_port_but_for_the_usual_one(
+    tmp_path: Path, tls: bool, port: int, host: str, status: int
+) -> None:
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front(("Arm.example", "fd00::7"), port, tls=tls))
+    good = {"host": host, "authorization": f"Bearer {tokens.add('script')}"}
+    assert status_of(guard, good) == status
+    if status == 200:
+        assert status_of(guard, {**good, "origin": f"{'https' if tls else 'http'}://{host}"}) == 200
+        assert status_of(guard, {**good, "origin": f"{'http' if tls else 'https'}://{host}"}) == 403
+
+
+def test_a_bearer_token_goes_before_the_cookie(tmp_path: Path) -> None:
+    """A script in a browser's session has the rights, and the name in the log, of its own token."""
+    tokens, callers = Tokens(tmp_path), []
+
+    async def page(scope: Scope, _receive: Receive, send: Send) -> None:
+        callers.append(scope["teds.caller"])
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    guard = Guard(page, tokens, front((), PORT, tls=False))
+    browser = f"ncap-{PORT}={tokens.login(tokens.login_link())}"
+    script = f"Bearer {tokens.add('plotter', read_only=True)}"
+    assert status_of(guard, {"host": HERE, "cookie": browser, "authorization": script}) == 200
+    assert status_of(guard, {"host": HERE, "cookie": browser}) == 200
+    assert [(caller.name, caller.kind, caller.read_only) for caller in callers] == [
+        ("plotter", "script", True),
+        ("browser", "browser", False),
+    ]
+    assert [(caller.actor, caller.owner) for caller in callers] == [("token plotter", "api:plotter"), ("page", "page")]
+    assert status_of(guard, {"host": HERE, "cookie": browser, "authorization": "Bearer nonsense"}) == 401

@@ -1,0 +1,253 @@
+"""What a command asks and says: questions, passphrases, notes and warnings, asked of ``App`` itself."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import click
+import pytest
+
+from teds_provision.cli.context import App
+from teds_provision.cli.rendering import LineReporter, LiveReporter, reporter_for
+from teds_provision.cli.terminal_operator import TerminalOperator
+from teds_provision.errors import NotWhitelistedError, PolicyError, WrongPassphraseError
+from teds_provision.protocol.fingerprints import read_fingerprint, same_key
+from teds_provision.provisioning.batch_sheet import DeclinedError
+from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.progress import SilentReporter
+
+UUID, KEY = "8d4d9da65281f7000000", "0123456789abcdef" * 4
+OTHER = KEY[:20] + "f" + KEY[21:]
+
+
+@pytest.fixture
+def app(tmp_path: Path) -> Iterator[Callable[..., App]]:
+    before = App.current
+    yield lambda **options: App(home=tmp_path, **options)
+    App.current = before
+
+
+@pytest.fixture
+def typed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]:
+    """Let answers be typed at a terminal; returns the questions as they were asked."""
+
+    def answer(*answers: str) -> list[dict[str, Any]]:
+        asked: list[dict[str, Any]] = []
+        left = list(answers)
+
+        def prompt(question: str, **how: Any) -> str:
+            asked.append({"question": question, **how})
+            return left.pop(0)
+
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
+        monkeypatch.setattr(click, "prompt", prompt)
+        monkeypatch.setattr(click, "confirm", lambda question, **how: prompt(question, **how) == "y")
+        return asked
+
+    return answer
+
+
+def descriptor_with(text: str) -> int:
+    read, write = os.pipe()
+    os.write(write, text.encode())
+    os.close(write)
+    return read
+
+
+# -- notes and warnings ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "shown"),
+    [
+        ({}, "a note\nWarning: a warning\n"),
+        ({"as_json": True}, "Warning: a warning\n"),
+        ({"quiet": True}, ""),
+        ({"quiet": True, "as_json": True}, ""),
+    ],
+)
+def test_a_warning_is_printed_beside_json_and_a_note_for_people_alone(
+    app: Callable[..., App], capsys: pytest.CaptureFixture[str], options: dict[str, bool], shown: str
+) -> None:
+    one = app(**options)
+    one.note("a note")
+    one.note("with -v", level=1)
+    one.warn("a warning")
+    assert capsys.readouterr() == ("", shown)
+
+
+@pytest.mark.parametrize(
+    ("options", "terminal", "several", "kind"),
+    [
+        ({"as_json": True}, True, False, SilentReporter),
+        ({"quiet": True}, True, False, SilentReporter),
+        ({}, False, False, LineReporter),
+        ({}, True, True, LineReporter),
+        ({}, True, False, LiveReporter),
+    ],
+)
+def test_progress_is_live_on_a_terminal_lines_in_a_pipe_and_none_with_json(
+    app: Callable[..., App],
+    monkeypatch: pytest.MonkeyPatch,
+    options: dict[str, bool],
+    terminal: bool,
+    several: bool,
+    kind: type,
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+    assert type(reporter_for(app(**options), several=several)) is kind
+
+
+# -- passphrases -------------------------------------------------------------------------------------------------------
+
+
+def test_one_line_of_the_descriptor_is_the_passphrase_and_is_read_once(app: Callable[..., App]) -> None:
+    read = descriptor_with("first line\nsecond line\n")
+    one = app(passphrase_fd=read)
+    assert one.has_passphrase
+    assert [one.ask_secret("Passphrase"), one.ask_secret("Again", confirm=True)] == ["first line"] * 2
+    os.close(read)
+    empty = descriptor_with("\nsecond line\n")
+    with pytest.raises(WrongPassphraseError):
+        app(passphrase_fd=empty).ask_secret("Passphrase")
+    os.close(empty)
+
+
+def test_a_new_passphrase_is_typed_twice_and_hidden(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]]
+) -> None:
+    asked = typed("old", "new", "newer")
+    assert [app().ask_secret("Old"), app().ask_secret("New", confirm=True), app().ask_new("Newer")] == [
+        "old", "new", "newer",
+    ]  # fmt: skip
+    assert [(how["hide_input"], how["confirmation_prompt"], how["err"]) for how in asked] == [
+        (True, False, True), (True, True, True), (True, True, True),
+    ]  # fmt: skip
+
+
+# -- keys --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("answers", "agreed"),
+    [
+        (["y"], True),
+        (["YES"], True),
+        (["n"], False),
+        (["", "No"], False),
+        ([KEY], True),
+        ([KEY[:32]], True),
+        ([KEY[:31], "n"], False),
+        ([KEY.upper()], True),
+        ([" ".join(KEY[at : at + 4] for at in range(0, 64, 4))], True),
+        (["-".join(KEY[at : at + 4] for at in range(0, 32, 4))], True),
+        ([OTHER], False),
+        ([OTHER[:32]], False),
+        ([f"TEDS1:{UUID}:{KEY}".upper()], True),
+        ([f"TEDS1:{UUID}:{OTHER}".upper()], False),
+        ([KEY + "0", "n"], False),
+    ],
+)
+def test_a_key_is_agreed_to_with_yes_or_with_its_digits(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]], answers: list[str], agreed: bool
+) -> None:
+    asked = typed(*answers)
+    assert app().ask_for_key("Trust it?", KEY) is agreed
+    assert len(asked) == len(answers)
+    assert {how["default"] for how in asked} == {"n"}
+
+
+def test_two_fingerprints_are_of_one_key_from_32_digits_on() -> None:
+    assert same_key(KEY, KEY[:32])
+    assert same_key(KEY[:32], KEY)
+    assert not same_key(KEY[:31], KEY)
+    assert not same_key(OTHER[:32], KEY)
+    texts = (
+        "0x" + KEY,
+        KEY[:32],
+        KEY.upper(),
+        ":".join(KEY[at : at + 2] for at in range(0, 64, 2)),
+        KEY[:31],
+        KEY + "0",
+    )
+    assert [read_fingerprint(text) for text in texts] == [KEY, KEY[:32], KEY, KEY, None, None]
+    assert read_fingerprint("-".join(KEY[at : at + 8] for at in range(0, 64, 8))) == KEY
+
+
+# -- the operator ------------------------------------------------------------------------------------------------------
+
+WHO: Any = SimpleNamespace(uuid=bytes.fromhex(UUID), fingerprint=KEY)
+
+
+def test_a_board_is_accepted_by_a_person_or_by_yes_which_adds_no_strangers_of_a_bus(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]]
+) -> None:
+    TerminalOperator(app(no_input=True), yes=True).accept(WHO)
+    for operator in (
+        TerminalOperator(app(no_input=True), yes=False),
+        TerminalOperator(app(no_input=True), yes=True, strangers=False),
+    ):
+        with pytest.raises(NotWhitelistedError) as refused:
+            operator.accept(WHO)
+        assert refused.value.hint == f"Add --yes, or: teds-provision whitelist add {UUID} --fingerprint {KEY}"
+    asked = typed("y", "n", "n")
+    person = TerminalOperator(app(), yes=False)
+    person.accept(WHO)
+    person.accept(WHO)
+    assert len(asked) == 1, "a board that is lost before it has a key is not asked about again"
+    assert KEY[:32] in asked[0]["question"]
+    assert KEY[:33] not in asked[0]["question"]
+    with pytest.raises(DeclinedError):
+        person.accept(cast("Any", SimpleNamespace(uuid=WHO.uuid, fingerprint=OTHER)))
+    with pytest.raises(DeclinedError):
+        TerminalOperator(app(), yes=True, strangers=False).accept(WHO)
+
+
+def test_another_stations_key_is_taken_over_by_a_person_alone(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]]
+) -> None:
+    refusal = PolicyError("It has another station's key.")
+    with pytest.raises(PolicyError, match="another station's key"):
+        TerminalOperator(app(no_input=True), yes=True).take_over("Take it over?", refusal)
+    typed("y", "n")
+    TerminalOperator(app(), yes=True).take_over("Take it over?", refusal)
+    with pytest.raises(DeclinedError):
+        TerminalOperator(app(), yes=True).take_over("Take it over?", refusal)
+
+
+@pytest.mark.parametrize(
+    ("options", "yes", "several", "asks"),
+    [
+        ({}, False, False, True),
+        ({}, True, False, False),
+        ({}, False, True, False),
+        ({"no_input": True}, False, False, False),
+        ({"as_json": True}, False, False, False),
+    ],
+)
+def test_a_yes_to_the_differences_retypes_one_board_and_nothing_else_does(
+    app: Callable[..., App],
+    typed: Callable[..., list[dict[str, Any]]],
+    options: dict[str, bool],
+    yes: bool,
+    several: bool,
+    asks: bool,
+) -> None:
+    differences: Sequence[str] = ("Channel 1 is in N, not in rad.",)
+    asked = typed("y", "n")
+    operator = TerminalOperator(app(**options), yes=yes, several=several)
+    if not asks:
+        with pytest.raises(WrongBoardError) as refused:
+            operator.retype(WHO.uuid, tuple(differences))
+        assert refused.value.hint.endswith("--retype")
+        assert asked == []
+        return
+    operator.retype(WHO.uuid, tuple(differences))
+    with pytest.raises(PolicyError, match="keeps its type"):
+        operator.retype(WHO.uuid, tuple(differences))
+    assert len(asked) == 2
