@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,14 @@ from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, 
 from teds_provision.files import make_folder, read_limited
 from teds_provision.plant.apply_pages import heads_digest
 from teds_provision.plant.evidence import TOOL, sign_evidence
-from teds_provision.plant.jobs import digest_of_file, profile_file, require_adopted, require_open
+from teds_provision.plant.jobs import (
+    digest_of_file,
+    now_of,
+    profile_file,
+    require_adopted,
+    require_open,
+    roster_of,
+)
 from teds_provision.plant.sign_requests import Office, SignatureOrder, by_office
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
@@ -231,7 +238,7 @@ class LineRun:
     def _require_fresh(self, path: Path, prepared: PreparedOrder) -> None:
         assert self.job is not None
         days = self.job.calibration.max_age_days or 0
-        now = datetime.now(UTC)
+        now = now_of(roster_of(self.station))
         for number, calibration in (prepared.calibrations or {}).items():
             if calibration.date is None or not now - timedelta(days=days) <= calibration.date <= now + timedelta(
                 days=1

@@ -8,7 +8,7 @@ import time
 import tomllib
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -238,9 +238,10 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
 
 def _built(station: Station, job: Job, request: SignRequest) -> Image:
     """Return the datasheet as this office makes it, with the read-only TEDS that the job lists; raises _Refused."""
+    now = now_of(roster_of(station))
     try:
         profile = _profile(station, job)
-        calibrations = _calibrations(job, request, profile)
+        calibrations = _calibrations(job, request, profile, now)
         check_name(request.name)
         built = profile.build(request.uuid, calibration=calibrations, name=request.name)
     except TedsProvisionError as error:
@@ -271,7 +272,7 @@ def _require_name(job: Job, request: SignRequest) -> None:
         raise _RefusedError("differs", f"the name {request.name!r} does not follow the job's pattern")
 
 
-def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int, Calibration]:
+def _calibrations(job: Job, request: SignRequest, profile: Profile, now: datetime) -> dict[int, Calibration]:
     octets, rule = request.calibration, job.calibration
     if rule.rule == "none":
         if octets is not None:
@@ -285,7 +286,6 @@ def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int,
     found = read_calibrations(*_text_of(octets), profile)
     if rule.rule == "any":
         days = timedelta(days=rule.max_age_days or 0)
-        now = datetime.now(UTC)
         if any(
             calibration.date is None or not now - days <= calibration.date <= now + timedelta(days=1)
             for calibration in found.values()

@@ -11,12 +11,13 @@ from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, merged_views, now, require_roster
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
-from teds_provision.protocol.plant.merged_claims import FirmwareClaim
+from teds_provision.protocol.plant.merged_claims import FirmwareClaim, MergedClaims
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.pages import Chain
 from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import NodeRecord
 
 SILENT: Final = timedelta(days=7)
 """A station whose newest page that counts is older than this is silent."""
@@ -189,6 +190,7 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
     digits = wanted.removeprefix("0x")
     while uuids := station.plant.claims.nodes(after, AT_ONCE):
         after = uuids[-1]
+        here = station.nodes.get_many(uuids)
         for uuid, seen in merged_views(station, roster, uuids).items():
             name = seen.name or ""
             if wanted and not uuid.hex().startswith(digits) and wanted not in name.lower():
@@ -210,6 +212,7 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
                     "sequence": newest[0] if newest is not None else None,
                     "written_by": newest[1] if newest is not None else None,
                     "profile": newest[2] if newest is not None else None,
+                    "older_than": _older_than(roster, seen, here.get(uuid)),
                     "firmware": _firmware_to_json(roster, seen.firmware[0]) if seen.firmware else None,
                     "firmware_by": {
                         roster.name_of(reported.station): _firmware_to_json(roster, reported)
@@ -219,6 +222,21 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
                 },
                 "conflicts": [{"name": conflict, "why": why} for conflict, why in seen.conflicts.items()],
             }
+
+
+def _older_than(roster: Roster, seen: MergedClaims, node: NodeRecord | None) -> str | None:
+    """Return the member with ``sign`` that wrote a newer datasheet than the one known here, None for none.
+
+    It informs: a sequence is chosen by what the store and the node have, never by a claim.
+    """
+    if node is None or not node.sequence:
+        return None
+    newer = [
+        (sequence, station)
+        for station, (sequence, _, _) in seen.written.items()
+        if sequence > node.sequence and roster.has(station, "sign")
+    ]
+    return roster.name_of(max(newer)[1]) if newer else None
 
 
 def _firmware_to_json(roster: Roster, reported: FirmwareClaim) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
@@ -40,6 +41,7 @@ from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, re
 from teds_provision.protocol.plant.roster import Place, RemovedMember, Roster
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import BuildOrder, PreparedOrder, prepare
+from teds_provision.provisioning.identify import IdentifiedNode
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision, verify_only
@@ -462,6 +464,20 @@ def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: 
     file.write_text(f"# date: {NOW - timedelta(days=3):%Y-%m-%d}\n{table}")
     build(line, board)
     assert units(line) == [(1, 1, 1)]
+
+
+def test_a_clock_before_the_roster_makes_no_calibration_fresh_again(tmp_path: Path, owner: Station) -> None:
+    """Now is never before the roster was made: a calibration that is too old then stays so."""
+    board = make_board(1)
+    later = {"created": NOW + timedelta(days=100), "expires": NOW + timedelta(days=190)}
+    join(owner, roster_of(owner, member(owner, "owner", *ALL), version=2, previous="ab" * 32, **later))
+    rule = CalibrationRule("any", max_age_days=30)
+    line = line_of(owner, tmp_path, calibration=rule, ends=NOW + timedelta(days=180))
+    file = tmp_path / f"{board.uuid.hex()}.csv"
+    for days, old in ((3, True), (-69, True), (-71, False), (-102, True)):
+        file.write_text(f"# date: {NOW - timedelta(days=days):%Y-%m-%d}\nraw, value\n0, 0\n16384, 6.283185307\n")
+        with pytest.raises(PolicyError, match="is dated") if old else nullcontext():
+            line.order(cast("IdentifiedNode", SimpleNamespace(uuid=board.uuid)))
 
 
 def test_a_job_is_a_keepers_word_and_its_id_means_one_job(tmp_path: Path, owner: Station) -> None:

@@ -264,6 +264,22 @@ def test_an_office_takes_no_calibration_that_is_too_old_or_dated_in_the_future(
     assert build(run, board).verified.verdict == "authentic"
 
 
+def test_a_clock_before_the_roster_makes_no_calibration_fresh_again_for_an_office(desk: Desk, tmp_path: Path) -> None:
+    board, table = make_board(1), "raw, value\n0, 0\n16384, 6.283185307\n"
+    (tmp_path / f"{board.uuid.hex()}.csv").write_text(f"# date: {datetime.now(UTC):%Y-%m-%d}\n{table}")
+    rule, ends = CalibrationRule("any", max_age_days=30), NOW + timedelta(days=180)
+    request = desk.request(desk.run(tmp_path, calibration=rule, ends=ends), board)
+    held = desk.office.plant.roster
+    assert held is not None
+    later = replace(
+        held, version=held.version + 1, created=NOW + timedelta(days=31), expires=NOW + timedelta(days=90), hash="",
+        octets=b"",
+    )  # fmt: skip
+    desk.plant.change(later)
+    reply = desk.asks(request)
+    assert (reply.refused, reply.why) == ("job", "the calibration is older than 30 days, or has no date")
+
+
 def test_an_office_notices_that_what_its_profile_extends_was_edited(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:

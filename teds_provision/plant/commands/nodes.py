@@ -87,8 +87,11 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "no holder"
         sentence = f"{held}{written}, firmware {_reported(says['firmware'])}{banned}"
         line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), sentence)))
+        writer = says["older_than"]
+        older = [f"  the datasheet known here is older than {shown(writer)} wrote"] if writer else []
         app.lines([
             line,
+            *older,
             *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"]),
             *(f"  also reported: firmware {_reported(seen)}" for seen in _others(says)),
         ])  # fmt: skip

@@ -1,0 +1,318 @@
+"""What contract/plant.md says of times and states, at the very edge; and its numbers, as literals."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import PolicyError, UsageError
+from teds_provision.plant import (
+    apply_pages,
+    doctor,
+    folder_transport,
+    office,
+    owner,
+    parcels,
+    removed_members,
+    service,
+    sign_requests,
+    status,
+    transport,
+)
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.plant import evidence, job, roster, sharing, signing
+from teds_provision.protocol.plant.claim import Claim
+from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share
+from teds_provision.station.plant.pages import PageRow
+from teds_provision.station.station import Station
+from tests.cli.shell import call
+from tests.plant.owner import ALL, alone, ca_of, join, member, roster_of
+
+NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
+NODE = bytes.fromhex("8d4d9da65281f7000000")
+H = "ab" * 32
+SECOND = timedelta(seconds=1)
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    made = alone(tmp_path / "alone")
+    yield made
+    made.close()
+
+
+def others(station: Station, **names: str) -> list[Member]:
+    """Return members with these roles, certified by the station's CA."""
+    ca = ca_of(station).ca()
+    assert ca is not None
+    keys = {name: SoftwareKey(5000 + number) for number, name in enumerate(names)}
+    return [
+        Member(name, key.point, ca.sign(station_key_message(key.point)), frozenset(names[name].split()))
+        for name, key in keys.items()
+    ]
+
+
+def held(station: Station, *members: Member, **changes: Any) -> Roster:
+    now = roster_of(station, member(station, "owner", *ALL), *members, version=2, previous=H, **changes)
+    join(station, now)
+    return now
+
+
+def paged(station: Station, of: str, n: int, created: str, hash: str = H) -> None:
+    """Have pages up to number n of a station here, the newest made then."""
+    with station.transaction():
+        chain = station.plant.pages.chain(of)
+        station.plant.pages.add(chain.id, PageRow(n, hash, "", created, "", b"", b"{}", bytes(64)))
+        station.plant.pages.put_chain(replace(chain, counted=(n, hash), folded=(n, hash)))
+
+
+def test_the_numbers_of_the_contract() -> None:
+    """Other tests reach these limits by the names of the constants: here they are what the contract says."""
+    day = timedelta(days=1)
+    numbers: dict[str, tuple[object, object]] = {
+        "a roster lasts 90 days by default": (roster.USUAL, timedelta(days=90)),
+        "its end is near from 14 days before": (roster.WARN_BEFORE, timedelta(days=14)),
+        "what is dated more than 24 hours ahead is not taken": (roster.MOST_AHEAD, day),
+        "a station is silent after 7 days": ((sharing.SILENT, status.SILENT), (7 * day, 7 * day)),
+        "10,000 nodes go into a bundle": (parcels.NODES, 10_000),
+        "a parcel lasts 7 days": ((parcels.DAYS, sign_requests.DAYS), (7, 7)),
+        "others rotate after 24 hours": (removed_members.OTHERS, day),
+        "16 answers a unit": (office.MOST_ANSWERS, 16),
+        "a request may be 65535 ahead": (office.MOST_JUMP, 65_535),
+        "nonces have 16 octets": ((evidence.NONCE_OCTETS, signing.NONCE_OCTETS), (16, 16)),
+        "a service asks each minute": (service.EVERY, 60),
+        "it writes a page each day": (service._EMPTY_PAGE, 86_400),
+        "64 MiB are the largest parcel": (folder_transport.LARGEST_PARCEL, 67_108_864),
+        "8 MiB, and 16 at once": ((transport.SMALL, transport.AT_ONCE), (8_388_608, 16)),
+        "boards of a list, stations, read-only TEDS": (
+            (job.MOST_BOARDS, job.MOST_STATIONS, job.MOST_READ_ONLY), (32_768, 256, 2_000)
+        ),
+        "which assurance is worth more": (
+            dict(job.WORTH), {"uuid": 0, "import": 0, "registry": 0, "bus": 1, "tap": 2}
+        ),
+        "why an office signs nothing": (
+            set(signing.REFUSALS),
+            {"not-line", "job", "full", "other-key", "proof", "differs", "guard", "sequence", "revoked"},
+        ),
+        "the first member": (owner.FIRST_ROLES, {"keeper", "sign", "line", "base"}),
+    }  # fmt: skip
+    assert {what: one for what, (one, _) in numbers.items()} == {what: due for what, (_, due) in numbers.items()}
+
+
+# -- the roster's time -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("left", "soon", "over"),
+    [
+        (timedelta(days=14) + SECOND, False, False),
+        (timedelta(days=14), True, False),
+        (SECOND, True, False),
+        (timedelta(0), True, True),
+        (-SECOND, True, True),
+    ],
+)
+def test_a_roster_warns_from_14_days_before_its_end_and_is_over_at_it(
+    station: Station, monkeypatch: pytest.MonkeyPatch, left: timedelta, soon: bool, over: bool
+) -> None:
+    now = station.plant.roster
+    record = station.plant.joined
+    assert now is not None
+    assert record is not None
+    monkeypatch.setattr(status, "now", lambda: now.expires - left)
+    found = status.status(station, record, now)
+    assert (found.expires_soon, found.expired, found.exit_code) == (soon, over, 6 if over else 0)
+    finding = doctor._roster(now, now.expires - left)
+    assert finding.result == ("failed" if over else "warning" if soon else "ok")
+
+
+def test_the_moment_of_a_clock_before_the_roster_is_that_of_the_roster(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = station.plant.roster
+    assert now is not None
+    for clock, moment in ((-SECOND, timedelta(0)), (SECOND, SECOND)):
+        monkeypatch.setattr(status, "now", lambda clock=clock: now.created + clock)
+        assert status.moment(now) == now.created + moment
+
+
+@pytest.mark.parametrize(("ahead", "taken"), [(timedelta(hours=24), True), (timedelta(hours=24) + SECOND, False)])
+@pytest.mark.parametrize("slow", [False, True], ids=["by the clock", "by the roster here, of a clock put back"])
+def test_a_roster_of_more_than_24_hours_ahead_is_not_taken_yet(
+    station: Station, monkeypatch: pytest.MonkeyPatch, ahead: timedelta, taken: bool, slow: bool
+) -> None:
+    own = station.plant.roster
+    assert own is not None
+    clock = own.created - timedelta(days=300) if slow else own.created + timedelta(hours=2)
+    monkeypatch.setattr(apply_pages, "now", lambda: clock)
+    created = max(clock, own.created) + ahead
+    new = roster_of(station, *own.members, version=2, previous=own.hash, created=created)
+    [(_, how, why)] = apply_pages.take_rosters(station, [new.octets])
+    assert how == ("taken" if taken else "refused")
+    assert why.startswith("" if taken else "it is dated in the future")
+    assert station.plant.roster == (new if taken else own)
+
+
+# -- the state of each station -----------------------------------------------------------------------------------------
+
+
+def test_each_station_has_its_state_and_age(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    week = 7 * 86_400
+    members = others(station, old="line", due="base", ahead="audit", quiet="sign", torn="line", newer="line")
+    gone = RemovedMember("west", SoftwareKey(99).point, frozenset({"line", "sign"}), "stolen", (0, ""))
+    now = held(station, *members, removed=(gone,))
+    at = {member.name: member.fingerprint for member in members}
+    moment = now.created + timedelta(days=20)
+    monkeypatch.setattr(status, "now", lambda: moment)
+
+    def created(seconds: int) -> str:
+        return f"{moment - timedelta(seconds=seconds):%Y-%m-%dT%H:%M:%SZ}"
+
+    paged(station, station.fingerprint, 3, created(9))
+    for name, seconds, n in (
+        ("old", week + 1, 5),
+        ("due", week, 7),
+        ("ahead", -50, 2),
+        ("torn", 8, 4),
+        ("newer", 8, 1),
+    ):
+        paged(station, at[name], n, created(seconds))
+    apply_pages.alarm(station, "two-histories", at["torn"], 5, "two")
+    newer = station.plant.pages.chain(at["newer"])
+    station.plant.pages.put_chain(replace(newer, waits="it is of a newer version"))
+    record = station.plant.joined
+    assert record is not None
+    found = status.status(station, record, now)
+    assert [(one.name, one.number, one.age, one.state) for one in found.standings] == [
+        ("owner", 3, 9, "here"),
+        ("old", 5, week + 1, "silent"),
+        ("due", 7, week, "heard"),
+        ("ahead", 2, 0, "heard"),
+        ("quiet", 0, None, "nothing said"),
+        ("torn", 4, 8, "two histories"),
+        ("newer", 1, 8, "newer version"),
+        ("west", 0, None, "stolen"),
+    ]
+    assert found.standings[-1].roles == ("line", "sign")
+    assert found.exit_code == 4
+    assert replace(found, standings=found.standings[1:]).exit_code == 6, "this one was removed"
+    assert parcels.silent_stations(station, now, moment) == {at["old"]}
+
+
+def test_heads_are_a_digest_of_the_newest_page_that_counts_of_every_chain(station: Station) -> None:
+    paged(station, "b" * 64, 10, "", "d" * 64)
+    paged(station, "a" * 64, 9, "", "e" * 64)
+    station.plant.pages.chain("c" * 64)  # none of its pages counts
+    lines = f"{'a' * 64} 9 {'e' * 64}\n{'b' * 64} 10 {'d' * 64}\n"
+    assert apply_pages.heads_digest(station) == (hashlib.sha256(lines.encode()).hexdigest()[:16], 2)
+
+
+# -- what others say of a node -----------------------------------------------------------------------------------------
+
+
+def test_a_datasheet_that_is_older_than_one_that_a_member_with_sign_wrote_is_shown(station: Station) -> None:
+    members = others(station, west="line sign", south="sign", east="line", left="sign")
+    gone = members.pop()
+    removed = RemovedMember("left", gone.point, gone.roles, "lost", (1, H))
+    now = held(station, *members, removed=(removed,))
+    named = {one.name: one.fingerprint for one in (*members, gone)}
+
+    def wrote(**sequences: int) -> str | None:
+        with station.transaction():
+            for name, digits in named.items():
+                written = (sequences[name], H, 1, "load-cell", None, None) if name in sequences else None
+                station.plant.claims.put(station.plant.pages.chain(digits).id, {NODE: Claim(written=written).to_json()})
+        [shown] = status.nodes(station, now)
+        older: str | None = shown["says"]["older_than"]
+        return older
+
+    assert wrote(west=9) is None, "this station knows no datasheet of it"
+    station.nodes.remember(NODE, sequence=5)
+    assert [wrote(west=5), wrote(west=4, south=5)] == [None, None]
+    assert [wrote(west=6), wrote(west=6, south=7), wrote(west=8, south=7)] == ["west", "south", "west"]
+    assert [wrote(east=9), wrote(left=9), wrote(east=9, west=6)] == [None, None, "west"], "who may not sign"
+    shown = call(station.home, "nodes", "--plant").out.splitlines()
+    assert shown[0].endswith("no holder, datasheet 9 by east, firmware not reported")
+    assert shown[1] == "  the datasheet known here is older than west wrote"
+
+
+# -- what the owner of the CA key may do -------------------------------------------------------------------------------
+
+
+def test_the_last_page_of_a_retired_one_is_the_newest_here_and_of_a_lost_one_it_must_be_named(station: Station) -> None:
+    west, south = others(station, west="line sign", south="base")
+    share = Share(("all", ""), (south.fingerprint, west.fingerprint))
+    only_west = Share(("group", "hand"), (west.fingerprint,))
+    now = held(station, west, south, share=(share, only_west))
+    paged(station, west.fingerprint, 1, "2026-01-01T00:00:00Z", "1" * 64)
+    paged(station, west.fingerprint, 2, "2026-01-02T00:00:00Z", "2" * 64)
+    for why in ("lost", "stolen"):
+        with pytest.raises(UsageError, match="Which is the last page of west that you trust"):
+            owner.draft_removal(station, "west", why, None)
+    retired = owner.draft_removal(station, "west", "retired", None)
+    assert retired.removed == (RemovedMember("west", west.point, west.roles, "retired", (2, "2" * 64)),)
+    assert retired.share == (Share(("all", ""), (south.fingerprint,)),)
+    assert (retired.version, retired.previous, retired.members) == (3, now.hash, (now.members[0], south))
+    assert owner.draft_removal(station, "west", "stolen", 1).removed[0].last == (1, "1" * 64)
+    assert owner.draft_removal(station, "west", "stolen", 0).removed[0].last == (0, "")
+    assert status.page_list(station, west.fingerprint, 1) == [(2, "2" * 64, "2026-01-02T00:00:00Z")]
+
+
+def test_a_list_of_pages_to_choose_from_has_the_last_20(station: Station) -> None:
+    for n in range(1, 23):
+        paged(station, H, n, f"2026-01-{n:02}T00:00:00Z")
+    assert [n for n, _, _ in status.page_list(station, H)] == list(range(22, 2, -1))
+
+
+def test_sign_is_lost_at_the_newest_page_and_a_keeper_is_only_removed(station: Station) -> None:
+    west, north = others(station, west="line sign", north="keeper sign")
+    held(station, west, north)
+    paged(station, west.fingerprint, 4, "", "4" * 64)
+
+    def changed(*roles: str, last: roster.Place | None = None) -> Member:
+        made = owner.with_roles(station, "west", frozenset(roles), last)  # type: ignore[arg-type]
+        return next(one for one in made.members if one.name == "west")
+
+    assert (changed("line").signed, changed("line", last=(2, H)).signed) == ((4, "4" * 64), (2, H))
+    assert (changed("sign").signed, changed("sign", last=(2, H)).signed) == (None, None)
+    with pytest.raises(PolicyError, match="north is a keeper"):
+        owner.with_roles(station, "north", frozenset({"sign"}), None)
+    owner.with_roles(station, "north", frozenset({"keeper"}), None)
+    held(station, replace(west, roles=frozenset({"line"}), signed=(3, H)), north)
+    assert (changed("base").signed, changed("line", last=(9, H)).signed) == ((3, H), (3, H)), "it stays as it was"
+    assert changed("line", "sign").signed is None
+
+
+def test_a_roster_is_renewed_for_so_many_days_from_now_never_from_before_the_one_that_it_follows(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = station.plant.roster
+    assert now is not None
+    for clock, begins in ((timedelta(days=5), timedelta(days=5)), (-timedelta(days=5), timedelta(0))):
+        monkeypatch.setattr(owner, "now", lambda clock=clock: now.created + clock)
+        made = owner.renewed(station, timedelta(days=90))
+        assert (made.created, made.expires) == (now.created + begins, now.created + begins + timedelta(days=90))
+        assert (made.version, made.previous, made.members) == (2, now.hash, now.members)
+
+
+def test_a_first_roster_has_this_station_alone_with_every_role_but_audit_for_90_days(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(PolicyError, match="already belongs to a registry"):
+        owner.draft_first(station, "plant")
+    record = station.plant.joined
+    assert record is not None
+    station.plant.put_record(replace(record, left="2026-01-01T00:00:00Z"))
+    monkeypatch.setattr(owner, "now", lambda: NOW)
+    made = owner.draft_first(station, "plant")
+    assert (made.version, made.previous, made.removed, made.share) == (1, "", (), ())
+    assert (made.created, made.expires) == (NOW, datetime(2026, 5, 30, 12, tzinfo=UTC))
+    [me] = made.members
+    assert (me.fingerprint, me.roles) == (fingerprint(station.point), frozenset({"keeper", "sign", "line", "base"}))
+    assert me.signed is None
