@@ -21,6 +21,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import dump as rows
 from teds_provision.station.store.records import Draft
 from teds_provision.station.store.schema import SCHEMA_VERSION
+from teds_provision.station.store.store import Store
 from teds_provision.teds.image import Image
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.backup.backups import back_up, opened, opened_octets
@@ -128,6 +129,12 @@ def test_a_dump_comes_back_row_for_row(station: Station) -> None:
     first = b"".join(station.rows())
     with Station.of_backup(Octets(first)) as copy:
         assert b"".join(copy.rows()) == first
+
+
+def test_a_store_that_is_damaged_in_its_backup_is_refused(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Store, "damage", lambda _store: "row 3 missing from index sightings_by_time")
+    with pytest.raises(BadDataError, match="The store in the backup is damaged"):
+        Station.of_backup(Octets(b"".join(station.rows())))
 
 
 def head(tables: dict[str, list[str]], schema: object = SCHEMA_VERSION) -> bytes:

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from teds_provision.cli import stdout
+from teds_provision.cli import main, stdout
+from teds_provision.cli.context import App
 from teds_provision.sanitize import printable, sanitize, sanitize_json
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
@@ -175,3 +176,18 @@ def test_work_that_failed_is_not_called_done(
     output: Any = SimpleNamespace(failure="No space left on device")
     assert stdout.ended(code, output, purpose=lambda: stdout.Purpose(only_shows, must_print=True)) == ends
     assert ("The work is done" in capsys.readouterr().err) is done
+
+
+def test_after_a_full_stdout_what_is_buffered_goes_nowhere(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The interpreter flushes it at its end, and would fail once more, with an exit code of its own."""
+    with open("/dev/full", "w") as full:
+        full.write("a result")
+        with pytest.raises(OSError, match="No space left") as failure:
+            full.flush()
+        monkeypatch.setattr(sys, "stdout", full)
+        monkeypatch.setattr(App, "current", None)
+        assert main._system_error([], failure.value) == 7
+        full.flush()
+    assert capsys.readouterr().err == "Error: Cannot write the result to stdout: No space left on device.\n"

@@ -284,3 +284,26 @@ def test_the_pause_begins_again_once_no_node_is_missing(monkeypatch: pytest.Monk
     assert not pace.is_due(wanted=False, missing=False, poll=None)
     now[0] += LEAST
     assert pace.is_due(wanted=False, missing=True, poll=None)
+
+
+def test_who_waits_for_the_next_round_gets_the_failure_of_the_bus_at_once() -> None:
+    made = CanDiscovery.__new__(CanDiscovery)
+    made._stop, made._asked, made._turn = threading.Event(), threading.Event(), threading.Condition()
+    made._begun = made._finished = 4
+    made.failure = None
+    rests: list[float] = []
+
+    def fails() -> None:
+        raise LinkError("The adapter was pulled out.")
+
+    def rest(seconds: float) -> None:
+        rests.append(seconds)
+        made._stop.set()
+
+    made._watch = fails  # type: ignore[method-assign]
+    made._stop.wait = rest  # type: ignore[assignment,method-assign]
+    made._asked.set()  # a thread that waits for round 5
+    made._run()
+    assert (made._begun, made._finished, made._asked.is_set()) == (5, 5, False)
+    assert made.failure is not None
+    assert (made.failure.message, rests) == ("The adapter was pulled out.", [1.0])

@@ -175,6 +175,38 @@ def test_a_node_that_is_on_another_bus_now_leaves_its_room_on_the_others(monkeyp
     assert (here.share.taken, other.share.taken) == ({UUID: 0.2}, {})
 
 
+def test_after_a_failed_session_only_a_sighting_since_then_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its place of before may be another node's by now."""
+    now, asked, again = [100.0], list[float](), list[object]()
+    supervisor = supervisor_at(now, monkeypatch)
+    bus = SimpleNamespace(share=BusShare(cast(Any, None)))
+
+    def find(_uuid: bytes, *, fresh: float, **_how: object) -> str:
+        asked.append(fresh)
+        return f"seen after {fresh}"
+
+    presence = SimpleNamespace(
+        find=find, let_announce=lambda _uuid: None, search_again=again.append, conflict_at=lambda _sighting: None
+    )
+    buses = SimpleNamespace(presence=presence, bus_of=lambda _sighting: bus, all=lambda: [bus])
+    monkeypatch.setattr(supervisor, "_buses", buses)
+    for step in ("_let_others_finish", "_wait_for_vault"):
+        monkeypatch.setattr(supervisor, step, lambda: None)
+    standing = SimpleNamespace(require_measurable=lambda: None)
+    monkeypatch.setattr(node_supervisor, "NodeStanding", lambda _station, _uuid: standing)
+
+    def fails(*_words: object) -> None:
+        now[0] += 5
+        raise LinkError("It is silent.")
+
+    monkeypatch.setattr(supervisor, "_in_session", fails)
+    for _ in range(3):
+        with pytest.raises(LinkError):
+            supervisor._try_once()
+    assert asked == [0.0, 105.0, 110.0]
+    assert again == ["seen after 0.0", "seen after 105.0", "seen after 110.0"]
+
+
 def test_a_node_that_begins_again_has_neither_its_error_nor_its_end_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
     reports, tries = list[NodeReport](), list[bool]()
     events = Events(lambda _block: None, lambda _facts: None, reports.append)

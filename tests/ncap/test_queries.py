@@ -10,6 +10,7 @@ import pytest
 from starlette.requests import Request
 
 from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, TedsProvisionError, UsageError
+from teds_provision.ncap.nodes.update_actions import UpdateRequest
 from teds_provision.ncap.web import app, clause12, metrics, resources
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError, _require_may_change
@@ -255,3 +256,45 @@ def test_the_metrics_are_held_whole() -> None:
         "# TYPE teds_plant_stations gauge",
         "teds_plant_stations 2",
     ]
+
+
+def asked_for(query: str) -> UpdateRequest:
+    """Return what a POST to /updates asks for, by a service whose node "arm" is also known by its UUID."""
+    known = {"arm": "aa" * 10, "aa" * 10: "aa" * 10, "leg": "bb" * 10}
+    daemon: Any = SimpleNamespace(known=lambda text: known[text])
+    return asyncio.run(resources.Resources(daemon)._update_request(request(query)))
+
+
+def test_a_board_that_is_named_twice_is_updated_once_in_the_order_of_the_names() -> None:
+    assert asked_for(f"nodes=leg,arm,{'aa' * 10},leg").uuids == ("bb" * 10, "aa" * 10)
+
+
+def test_an_update_without_more_words_goes_board_by_board_to_no_other_type_and_to_no_older_version() -> None:
+    assert asked_for("nodes=arm") == UpdateRequest(
+        ("aa" * 10,), frozenset(), allow_downgrade=False, parallel=1, wait=180
+    )
+
+
+def test_the_words_of_an_update_are_read() -> None:
+    query = "nodes=arm,leg&other_board=leg&allow_downgrade=1&parallel=24&wait=3600"
+    assert asked_for(query) == UpdateRequest(
+        ("aa" * 10, "bb" * 10), frozenset({"bb" * 10}), allow_downgrade=True, parallel=24, wait=3600
+    )
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("", "An update needs nodes or match."),
+        ("nodes=arm&match=a*", "An update needs nodes or match."),
+        ("nodes=arm&parallel=25", "parallel must be a whole number from 1 to 24."),
+        ("nodes=arm&parallel=0", "parallel must be a whole number from 1 to 24."),
+        ("nodes=arm&wait=3601", "wait must be a whole number from 1 to 3600."),
+        ("nodes=arm&allow_downgrade=2", "allow_downgrade must be 1 or 0."),
+        (f"nodes={','.join(['arm'] * 1001)}", "nodes may name at most 1000 nodes."),
+    ],
+)
+def test_an_update_of_other_words_is_refused(query: str, message: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        asked_for(query)
+    assert refused.value.message == message

@@ -611,3 +611,15 @@ def test_a_request_that_was_answered_is_taken_again_when_it_is_asked_again(monke
         (come,) = inbox.collect()
         assert inbox.collect() == [], "each is given once until it is dropped"
         come.drop()
+
+
+@pytest.mark.parametrize(("seconds", "pause", "slept"), [(1.0, 0.05, 0.05), (0.02, 0.4, 0.02), (0.0, 0.4, 0.0)])
+def test_without_notifications_an_office_looks_again_after_the_shorter_of_both_times(
+    seconds: float, pause: float, slept: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rests: list[float] = []
+    monkeypatch.setattr(sign_requests, "time", SimpleNamespace(sleep=rests.append))
+    station: Any = SimpleNamespace(identity=SimpleNamespace(fingerprint="ab" * 32))
+    folder: Any = SimpleNamespace()
+    Inbox(station, folder, SIGN_REQUEST).wait(seconds, pause)
+    assert rests == [slept]

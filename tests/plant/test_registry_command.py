@@ -477,3 +477,26 @@ def test_a_node_on_which_stations_do_not_agree_says_so_itself(desk: Desk) -> Non
     shown = desk.run("south", "nodes", "--plant", UUID).out
     assert "no holder, firmware not reported\n" in shown
     assert "1 conflict," in desk.run("south", "registry", "status").out
+
+
+def test_a_roster_is_signed_and_put_in_force_under_the_lock_of_the_store(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two commands beside each other would sign two rosters of one version, an alarm at every station."""
+    held: list[tuple[str, bool]] = []
+
+    def watch(place: Any, name: str) -> None:
+        does = getattr(place, name)
+
+        def watched(station: Station, *words: Any, **named: Any) -> Any:
+            held.append((name, station._held > 0))
+            return does(station, *words, **named)
+
+        monkeypatch.setattr(place, name, watched)
+
+    watch(plant.owner, "signed")
+    watch(plant.owner, "join")
+    watch(plant.apply_pages, "put_roster")
+    desk.ask("north", "registry", "create", "--name", "plant Augsburg", "--yes")
+    desk.ask("north", "registry", "renew", "--days", 30, "--yes")
+    assert held == [("signed", True), ("join", True), ("signed", True), ("put_roster", True)]

@@ -7,7 +7,8 @@ import sqlite3
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -318,6 +319,31 @@ def test_a_measurement_warns_or_refuses(station: Station, tmp_path: Path, report
     refused = "its firmware is" in warns
     with pytest.raises(FirmwareError) if refused else nullcontext():
         require_good_firmware(board.uuid, known)
+
+
+@pytest.mark.parametrize(
+    ("known", "refused"),
+    [
+        (None, "not-reported"),
+        ("not-reported", "not-reported"),
+        ("bad", "bad"),
+        ("other", "other"),
+        ("outdated", "outdated"),
+        ("on-trial", "on-trial"),
+        ("good", ""),
+        ("unjudged", ""),
+    ],
+)
+def test_where_only_good_firmware_is_admitted_a_node_that_never_reported_any_is_refused(
+    known: Any, refused: str
+) -> None:
+    reported = None if known is None else SimpleNamespace(state=known)
+    if not refused:
+        require_good_firmware(bytes(range(10)), cast(Any, reported))
+        return
+    with pytest.raises(FirmwareError) as failure:
+        require_good_firmware(bytes(range(10)), cast(Any, reported))
+    assert failure.value.message == f"The firmware of node 00010203040506070809 is {refused}."
 
 
 @pytest.mark.parametrize("report", [GOOD, None])

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import cbor2
 import pytest
@@ -25,6 +25,7 @@ from teds_provision.errors import (
     WrongImageError,
 )
 from teds_provision.links import LinkSettings
+from teds_provision.node import virtual
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
@@ -467,6 +468,33 @@ HOSTILE: dict[str, tuple[Callable[[SmpPacket, int], bytes], type[Exception], int
         NotAuthenticError,
         1,
     ),
+    "the reply to another command": (
+        lambda packet, number: (
+            packet._replace(command=packet.command._replace(number=0)).reply(b"\xa1\x63off\x05").encode()
+        ),
+        NotAuthenticError,
+        1,
+    ),
+    "the reply of another group": (
+        lambda packet, number: (
+            packet._replace(command=packet.command._replace(group=0)).reply(b"\xa1\x63off\x05").encode()
+        ),
+        NotAuthenticError,
+        1,
+    ),
+    "its own request": (lambda packet, number: packet._replace(body=b"\xa1\x63off\x05").encode(), NotAuthenticError, 1),
+    "a length that is wrong": (
+        lambda packet, number: (
+            packet.reply(b"\xa1\x63off\x05").encode()[:3]
+            + b"\x05"
+            + b"\0\1"
+            + bytes([packet.sequence, 1])
+            + b"\xa1\x63off\x05"
+        ),
+        NotAuthenticError,
+        1,
+    ),
+    "flags": (lambda packet, number: b"\3\1" + packet.reply(b"\xa1\x63off\x05").encode()[2:], NotAuthenticError, 1),
     "other octets than were sent": (reply_with(off=9728, match=False), NotAuthenticError, 1),
     "SMP's error of version 1": (reply_with(rc=8), PolicyError, 1),
     "SMP's error of version 2": (reply_with(err={"group": 1, "rc": 30}), PolicyError, 1),
@@ -570,3 +598,40 @@ def test_a_board_whose_update_is_cut_by_the_end_of_the_service_is_not_lost(
     done = update_at(bench.station, port, bench.uuid, order, SilentReporter(), timeout=1.0, is_ending=lambda: ends)
     assert done.result == "lost"
     assert [entry.outcome for entry in bench.station.audit_log.entries() if entry.act == "update"] == logged
+
+
+class KeptTimer:
+    """Stands for a timer; a test lets its time pass."""
+
+    made: ClassVar[list[KeptTimer]] = []
+
+    def __init__(self, seconds: float, work: Callable[[], None]) -> None:
+        self.seconds, self.work, self.started = seconds, work, False
+        self.made.append(self)
+
+    def start(self) -> None:
+        self.started = True
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "runs"), [(False, "1.0.0"), (True, "1.1.0")], ids=["nobody confirms", "it is confirmed"]
+)
+def test_a_trial_that_nobody_confirms_ends_after_ten_minutes(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch, *, confirmed: bool, runs: str
+) -> None:
+    monkeypatch.setattr(KeptTimer, "made", [])
+    monkeypatch.setattr(virtual, "threading", SimpleNamespace(Timer=KeptTimer))
+    slots = bench.node._slots
+    assert slots is not None
+    bench.node.restart()
+    assert KeptTimer.made == [], "its image is confirmed"
+    slots.write(0, owner.new.octets)
+    slots.flush()
+    slots.start_next(owner.new.digest)
+    bench.node.restart()
+    (timer,) = KeptTimer.made
+    assert (timer.seconds, timer.started, slots.running.version_text, slots.on_trial) == (600.0, True, "1.1.0", True)
+    if confirmed:
+        slots.confirm()
+    timer.work()
+    assert (slots.running.version_text, slots.on_trial, len(KeptTimer.made)) == (runs, False, 1)

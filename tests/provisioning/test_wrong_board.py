@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeRefusedError, PolicyError
+from teds_provision.errors import NodeRefusedError, NodeSilentError, PolicyError
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
@@ -288,6 +290,27 @@ def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: Virtu
     boards._note(right)
     assert (right.row, right.result) == (1, "passed")
     assert boards.totals().passed == 1
+
+
+def test_a_board_of_the_bus_that_failed_gives_its_row_back_to_the_next_board(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sheet = tmp_path / "boards.csv"
+    sheet.write_text("uuid,name,profile\n,cell,load-cell\n")
+    boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(None, BuildOrder(), sheet=sheet), SilentReporter())
+
+    def takes_a_row(node: Conversation, _operator: Any, _reporter: Any = None) -> None:
+        boards._for(SimpleNamespace(uuid=node.uuid, fingerprint="ab" * 32))  # type: ignore[arg-type]
+        raise NodeSilentError("It does not answer any more.")
+
+    monkeypatch.setattr(boards, "_provision", takes_a_row)
+    for number in (1, 2):
+        board = virtual(tmp_path / f"board{number}", FORCE)
+        done = boards._board(on_reader(board), "bus", AcceptingOperator())
+        assert done is not None
+        assert isinstance(done.error, NodeSilentError)
+        assert (done.row, boards._rows) == (1, {})
+        boards._note(done)
 
 
 def test_channels_without_a_valid_reading_are_counted_in_the_warning() -> None:

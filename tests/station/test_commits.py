@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -432,3 +434,18 @@ def begin():
 def test_statements_leave_nothing_in_the_cache_of_each_nodes_thread() -> None:
     """The connection's list of cursors was made longer by all threads in turn: each kept its former memory."""
     assert kept_by_each_thread(_STATEMENTS, first=3, rounds=90) < 1500
+
+
+def test_a_flush_waits_first_for_what_is_still_written_behind_the_run(watched: StatementLog) -> None:
+    """It would else bring the commits before onto the disk, and report the newest as kept."""
+    store = watched.station._store
+    waits: list[int] = []
+    behind: Any = SimpleNamespace(wait=lambda: waits.append(store._settled))
+    store.background[threading.get_ident()] = behind
+    try:
+        store.flush()
+        assert len(waits) == 1
+        store.flush(through=0)
+        assert len(waits) == 2
+    finally:
+        del store.background[threading.get_ident()]

@@ -7,6 +7,7 @@ import struct
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit, read_calibrations
 from teds_provision.teds.codec.frame import frame, unframe
-from teds_provision.teds.curve import channel_of
+from teds_provision.teds.curve import Curve, channel_of
 from teds_provision.teds.guard import GuardFinding, check_calibration
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
@@ -482,3 +483,13 @@ def test_an_exchange_of_gain_and_offset_is_named_as_such_alone() -> None:
         "(the calibration covers raw 4194304 to 12582912; say raw-range in the profile if the channel gives no others)"
     )
     assert all(message.endswith(covers) for _, code, message in found if code == "limits")
+
+
+@pytest.mark.parametrize(
+    ("results", "noise"),
+    [([0.5, -2.0, 1.0], 1.9073486328125e-06), ([1.0, math.nan, math.inf], 9.5367431640625e-07), ([math.nan], 0.0)],
+)
+def test_differences_below_eight_steps_of_a_float32_are_noise(results: list[float], noise: float) -> None:
+    """One step is 2^-23 of the largest result."""
+    curve: Any = SimpleNamespace(result=np.array(results))
+    assert Curve.noise.fget(curve) == noise  # type: ignore[attr-defined]

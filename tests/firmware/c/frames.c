@@ -737,6 +737,29 @@ static void what_strangers_ask_takes_no_place_of_a_session(void)
     memory_free(board);
 }
 
+/* A main loop that sleeps until teds_poll's time would keep a refusal, or a flow control, until something else is due. */
+static void what_waits_to_leave_is_due_now(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    memory_at(board, now);
+    CHECK(memory_poll(board) > now, "nothing is due");
+    in(board, TO_NODE, "\x1f\xff\x77\x00\x00\x01\x03\x00", 8, false);
+    CHECK(memory_poll(board) == now, "a refusal");
+    CHECK(out(board, &identifier, data) == 8 && data[5] == 10, "it leaves");
+    CHECK(memory_poll(board) > now, "once");
+    asks_for_much(board);
+    CHECK(memory_poll(board) == now, "a flow control");
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "it leaves");
+    CHECK(memory_poll(board) == now + 1000 * MS, "then the next frame of the question, within a second");
+    rest_of_question(board);
+    CHECK(memory_poll(board) <= now, "an answer");
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "its first frame leaves");
+    CHECK(memory_poll(board) == now + 1000 * MS, "then a flow control, within a second");
+    memory_free(board);
+}
+
 /* One spare line is that of a long request that comes in, the other's answer has just begun: a station without a line is
  * refused, not ignored. */
 static void a_station_without_a_line_is_refused(void)
@@ -1096,6 +1119,7 @@ int main(void)
     any_flow_control_is_borne();
     an_answer_to_everyone_gives_way();
     what_strangers_ask_takes_no_place_of_a_session();
+    what_waits_to_leave_is_due_now();
     a_station_without_a_line_is_refused();
     one_station_does_not_hold_the_place_of_long_requests();
     a_reply_that_is_another_link_s_is_nobodys();

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from teds_provision.errors import NodeSilentError, NoReaderError, UsageError
-from teds_provision.links.ble import ble_errors
+from teds_provision.links.ble import ble_errors, bluez
 from teds_provision.links.ble.spec import BleSpec, parse_spec
 
 
@@ -116,3 +116,23 @@ def test_the_words_of_a_full_adapter_and_of_a_silent_node() -> None:
     assert ble_errors.silent("C1", Exception("the connection ended. ")).message == f"{silent} (the connection ended)."
     assert ble_errors.silent("C1", TimeoutError()).message == f"{silent} (TimeoutError)."
     assert ble_errors.silent("C1", NodeSilentError("It is gone.")).message == f"{silent} (It is gone)."
+
+
+@pytest.mark.parametrize(
+    ("interfaces", "held"),
+    [
+        ({"org.bluez.Device1": ("/org/bluez/hci0", True)}, True),
+        ({"org.bluez.Device1": ("/org/bluez/hci0", False)}, False),
+        ({"org.bluez.Device1": ("/org/bluez/hci1", True)}, False),
+        ({"org.bluez.Adapter1": ("/org/bluez/hci0", True)}, False),
+    ],
+    ids=["its own", "not connected", "another adapter's", "an adapter"],
+)
+def test_an_adapter_holds_the_connections_of_its_own_devices(
+    interfaces: dict[str, tuple[str, bool]], held: bool
+) -> None:
+    as_dbus = {
+        name: {"Adapter": SimpleNamespace(value=adapter), "Connected": SimpleNamespace(value=connected)}
+        for name, (adapter, connected) in interfaces.items()
+    }
+    assert bluez._is_held(as_dbus, "/org/bluez/hci0") is held

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import socket
+from queue import Empty, SimpleQueue
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import can
 import pytest
@@ -14,6 +15,7 @@ from can.interfaces.virtual import VirtualBus
 from teds_provision.errors import LinkError, UsageError
 from teds_provision.links.can import bus as bus_module
 from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.bus_multiplexer import BusReader
 from teds_provision.links.can.interface_keys import known_keys
 from teds_provision.links.can.spec import parse_spec
 from tests.pace import PATIENCE
@@ -210,3 +212,38 @@ def test_keys_that_an_interface_picks_out_of_what_it_is_given_are_known() -> Non
     assert {"port", "hop_limit", "receive_own_messages"} <= known_keys("udp_multicast")
     assert {"host", "port"} <= known_keys("socketcand")
     assert known_keys("no such interface") == frozenset()
+
+
+class FailedBus:
+    """A bus that fails at its third frame; it counts who reads on."""
+
+    can_be_waited_for = stamps_arrivals = True
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def receive(self, _seconds: float) -> Frame | None:
+        """Return a frame, or fail."""
+        self.reads += 1
+        if self.reads == 3:
+            raise LinkError("The adapter was pulled out.")
+        assert self.reads < 3, "it is read on"
+        return Frame(0x18DAF121, b"a")
+
+    def wait(self, seconds: float, woken: object) -> None:
+        """Return at once."""
+
+
+def test_after_a_bus_has_failed_nobody_reads_it_any_more() -> None:
+    """Reading on would spin, and hand the failure to everyone again and again."""
+    bus: Any = FailedBus()
+    taken, failures = list[Frame](), list[LinkError]()
+    loop = BusReader(bus, taken.append, failures.append, cast(Any, None))
+    loop._read_all()
+    loop.run()
+    waiting: SimpleQueue[Frame] = SimpleQueue()
+    with pytest.raises(Empty):
+        loop.wait_for(waiting, 0.0)
+    with pytest.raises(Empty):
+        loop.wait_for(waiting, 0.001)
+    assert (bus.reads, len(taken), len(failures)) == (3, 2, 1)

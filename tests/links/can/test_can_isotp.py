@@ -456,3 +456,12 @@ def test_a_single_frame_in_the_middle_of_a_message_ends_it_and_comes_first() -> 
     wire.node.handle_frame(Frame(physical_id(NODE, STATION), single(b"abc")))
     wire.node.handle_frame(Frame(physical_id(NODE, STATION), single(b"def")))
     assert [wire.node.received() for _ in range(3)] == [b"abc", b"def", None]
+
+
+def test_of_a_message_that_a_single_frame_ended_nothing_comes_any_more() -> None:
+    """ISO 15765-2: the two are not read beside each other."""
+    wire, identifier = Wire(), physical_id(NODE, STATION)
+    for octets in ("100a010203040506", "0363626143434343", "210708090acccccc"):
+        wire.node.handle_frame(Frame(identifier, bytes.fromhex(octets)))
+    assert [wire.node.received() for _ in range(2)] == [b"cba", None]
+    assert not wire.node.receiving

@@ -254,6 +254,28 @@ def test_rows_of_a_grid_are_made_as_the_recording_is_read_although_a_stream_has_
     assert set(range(7, 60)) <= set(begun), "five seconds, and two periods, after its last value"
 
 
+def test_a_slow_stream_is_waited_for_by_two_of_its_own_periods_and_five_seconds() -> None:
+    """Its value of second 10 comes late in the recording: the row of that second has it all the same."""
+    slow = replace(FORCE, period=10.0)
+    recording: Any = SimpleNamespace(facts={ANGLE.key: ANGLE, slow.key: slow}, station=STATION)
+    at = STATION.started
+
+    def entries() -> Iterator[Any]:
+        for second in range(40):
+            if second in (0, 24):
+                yield block([[second]], uuid=HAND, channels=(2,), start=at + second % 14)
+            yield block([[second]], start=at + second)
+            yield ()
+
+    rows = {
+        round(float(time) - at, 3): [float(value) for value in values]
+        for made in converting._gridded(entries(), recording)
+        for time, values in zip(made.time, made.value, strict=True)
+    }
+    assert rows[10.0] == [1.0, 2.4]
+    assert sorted(second for second in rows if second == int(second)) == list(range(40))
+
+
 def test_of_very_many_notes_the_first_are_shown() -> None:
     """How it began to go wrong says more than how it went on."""
     summary = RecordingSummary()

@@ -254,6 +254,27 @@ def test_another_datasheet_begins_a_part_and_the_same_one_does_not(tmp_path: Pat
     assert "ef" * 32 in Path(files[1]).read_text()
 
 
+def test_every_part_of_an_mcap_declares_the_topics_of_its_own_values(tmp_path: Path) -> None:
+    """Also those of a node without a datasheet; a part without them could not be read."""
+    bare = block([[7], [9]], uuid=HAND, channels=(2,))
+    sink = McapSink(tmp_path / "run.mcap")
+    sink._prepare((ANGLE,), STATION)
+    sink._begin()
+    sink._process_item(block())
+    sink._process_item(bare)
+    sink._new_part()
+    sink._process_item(block(index=3))
+    sink._process_item(bare)
+    sink._close_part()
+    assert sink.files == (str(tmp_path / "run.mcap"), str(tmp_path / "run.2.mcap"))
+    for file in sink.files:
+        found = floats(Path(file))
+        assert {topic: [value for _, value in values] for topic, values in found.items()} == {
+            "/bench/arm/angle": [0.1, 0.2, 0.3],
+            "/bench/n8d4d9da6/ch2": [0.7, 0.9],
+        }
+
+
 def test_names_from_datasheets_break_neither_csv_nor_spreadsheet(tmp_path: Path) -> None:
     hostile = ChannelFacts(ARM, '=cmd|"x"', 1, "a,b\n\x1b[31m")
     record(tmp_path / "run.csv", [block()], facts=[hostile])

@@ -1,0 +1,202 @@
+"""What the children of the ROS sinks make of their parent's lines, without any ROS; what DDS refuses is counted."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.measure.sinks.ros import rclpy_child, ros1_child
+from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
+from teds_provision.measure.sinks.vectors import Meaning
+
+
+class Stamp(SimpleNamespace):
+    """The stamp of a header of either ROS."""
+
+    @staticmethod
+    def from_sec(seconds: float) -> Stamp:
+        """Return a ROS 1 time."""
+        return Stamp(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+
+
+class Temperature:
+    """A message with a header and a variance."""
+
+    def __init__(self) -> None:
+        self.header = SimpleNamespace(stamp=Stamp(), frame_id="nobody's")
+        self.temperature, self.variance = 0.0, 0.0
+
+
+class Float64:
+    """A message of a number alone, which may not get any other field."""
+
+    __slots__ = ("data",)
+
+
+class Joints:
+    """A row of a group."""
+
+    def __init__(self) -> None:
+        self.header = SimpleNamespace(stamp=Stamp(), frame_id="")
+        self.name, self.position, self.velocity, self.effort = [], [], [1.0], [1.0]  # type: ignore[var-annotated]
+
+
+class Publisher:
+    """Keeps what was published."""
+
+    def __init__(self, connections: int = 0) -> None:
+        self.sent: list[Any] = []
+        self.connections = connections
+
+    def publish(self, message: Any) -> None:
+        """Keep it."""
+        self.sent.append(message)
+
+    def get_num_connections(self) -> int:
+        """Return the number of readers that are there."""
+        return self.connections
+
+
+def child(way: str, kind: type) -> tuple[Any, Publisher]:
+    """Return the bridge of a child with one publisher, of number 1, and that publisher."""
+    publisher, bridge = Publisher(), None
+    if way == "rclpy":
+        bridge = rclpy_child.Bridge(None, SimpleNamespace(add_on_set_parameters_callback=lambda _callback: None))
+        bridge.publishers[1] = publisher, kind
+        return bridge, publisher
+    old = ros1_child.Bridge(SimpleNamespace(Time=Stamp), None)
+    old.publishers[1] = ros1_child.Outlet(publisher, kind, 0)
+    return old, publisher
+
+
+BOTH = pytest.mark.parametrize("way", ["rclpy", "rospy"])
+
+
+@BOTH
+def test_a_value_goes_with_its_time_its_frame_and_its_variance(way: str) -> None:
+    bridge, publisher = child(way, Temperature)
+    bridge.value({"id": 1, "t": 12.25, "field": "temperature", "frame": "arm", "v": 21.5, "var": 0.0625})
+    (message,) = publisher.sent
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 250_000_000)
+    assert (message.header.frame_id, message.temperature, message.variance) == ("arm", 21.5, 0.0625)
+
+
+@BOTH
+def test_a_message_without_header_and_variance_has_the_value_alone(way: str) -> None:
+    bridge, publisher = child(way, Float64)
+    bridge.value({"id": 1, "t": 12.25, "field": "data", "frame": "arm", "v": 21.5, "var": 0.0625})
+    assert [message.data for message in publisher.sent] == [21.5]
+
+
+@BOTH
+def test_a_row_of_joints_has_its_names_and_nan_where_a_value_is_missing(way: str) -> None:
+    bridge, publisher = child(way, Joints)
+    bridge.named({"id": 1, "v": ["elbow", "wrist"]})
+    bridge.joint({"id": 1, "t": 3.5, "v": [0.5, None], "eff": [7.0, 8.0]})
+    bridge.joint({"id": 1, "t": 4.5, "v": [0.5, 0.25], "vel": [5.0, 6.0]})
+    first, second = publisher.sent
+    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (3, 500_000_000)
+    assert (first.name, first.velocity, first.effort) == (["elbow", "wrist"], [], [7.0, 8.0])
+    assert first.position[0] == 0.5
+    assert math.isnan(first.position[1])
+    assert (second.position, second.velocity, second.effort) == ([0.5, 0.25], [5.0, 6.0], [])
+
+
+@BOTH
+def test_the_fields_of_a_compound_message_go_by_their_paths_and_one_that_is_unknown_is_left_out(way: str) -> None:
+    bridge, publisher = child(way, Temperature)
+    bridge.compound({"id": 1, "t": 3.5, "frame": "arm", "v": {"header.seq": 4, "temperature": 2.5, "radiation": 1}})
+    (message,) = publisher.sent
+    assert (message.header.stamp.sec, message.header.frame_id, message.temperature) == (3, "arm", 2.5)
+    assert not hasattr(message, "radiation")
+    assert not hasattr(message.header, "seq")
+
+
+def test_first_messages_wait_for_each_expected_subscriber_but_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A subscriber that the master still lists may be dead."""
+    now = [50.0]
+    pauses: list[float] = []
+    monkeypatch.setattr(ros1_child, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=pauses.append))
+    publisher = Publisher()
+    outlet = ros1_child.Outlet(publisher, Float64, 2)
+    outlet.publish("a")
+    now[0], publisher.connections = 50.9, 1
+    outlet.publish("b")
+    assert (publisher.sent, outlet.met()) == ([], False)
+    now[0] = 51.0
+    assert outlet.met()
+    assert publisher.sent == ["a", "b"]
+    outlet.publish("c")
+    assert (publisher.sent, pauses) == (["a", "b", "c"], [])
+
+
+def test_waiting_messages_go_as_soon_as_the_last_subscriber_is_there_in_bursts_of_twenty(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses: list[float] = []
+    monkeypatch.setattr(ros1_child, "time", SimpleNamespace(monotonic=lambda: 50.0, sleep=pauses.append))
+    publisher = Publisher()
+    outlet = ros1_child.Outlet(publisher, Float64, 2)
+    for number in range(41):
+        outlet.publish(number)
+    assert publisher.sent == []
+    publisher.connections = 2
+    outlet.publish(41)
+    assert publisher.sent == list(range(42))
+    assert pauses == [0.002, 0.002]
+
+
+def test_the_masters_list_of_subscribers_is_reused_for_a_part_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, looks = [50.0], [0]
+
+    def state() -> Any:
+        looks[0] += 1
+        if looks[0] == 3:
+            raise OSError("the master is gone")
+        return [], [["/arm", ["/a"] * looks[0]]], []
+
+    monkeypatch.setattr(ros1_child, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    bridge = ros1_child.Bridge(None, SimpleNamespace(getSystemState=state))
+    seen = []
+    for now[0] in (50.0, 50.3, 50.5, 50.7, 50.9):
+        seen.append((bridge.subscribers("/arm"), bridge.subscribers("/leg")))
+    assert seen == [(1, 0), (1, 0), (2, 0), (2, 0), (0, 0)]
+
+
+def test_what_no_reader_of_dds_takes_counts_with_all_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    core = pytest.importorskip("cyclonedds.core")
+
+    def full(_message: Any) -> None:
+        raise core.DDSException(core.DDSException.DDS_RETCODE_TIMEOUT)
+
+    sink = Ros2Sink("ros2:7")
+    monkeypatch.setattr(sink, "_writer", lambda *_topic, **_latched: SimpleNamespace(write=full))
+    kinds = pytest.importorskip("teds_provision.measure.sinks.ros.ros2_types")
+    sink._types = kinds
+    dropped = []
+    for write in (
+        lambda: sink._array("/arm", 1.0, ["a", "b", "c"], [1.0, 2.0, 3.0]),
+        lambda: sink._scalar(
+            "/oil", Meaning("sensor_msgs/Temperature", "temperature", 0.0, True), 1.0, "arm", 2.0, 0.5
+        ),
+        lambda: sink._fields(
+            "/hand", "geometry_msgs/WrenchStamped", 1.0, "", {"wrench.force.x": 1.0, "wrench.force.y": 2.0}
+        ),
+        lambda: sink._latched("/arm/teds", "{}"),
+        lambda: sink._diagnose(1.0, []),
+    ):
+        write()
+        dropped.append(sink.stats.dropped)
+    assert dropped == [3, 4, 6, 6, 6]
+
+
+def test_the_counters_of_a_sink_are_those_of_the_moment_when_they_were_asked_for() -> None:
+    sink = Ros2Sink("ros2:7")
+    sink._count(written=3, dropped=1)
+    before = sink.stats
+    sink._count(written=2, dropped=5)
+    assert (before.written, before.dropped) == (3, 1)
+    assert (sink.stats.written, sink.stats.dropped) == (5, 6)
