@@ -1,0 +1,409 @@
+"""``identify``, ``agree``, ``reset``, ``address``, ``locate``, ``update``: what they print and pass on, whole."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision import firmware_image, provisioning
+from teds_provision.errors import (
+    BoardLostError,
+    DowngradeError,
+    NoNodeError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+    TedsProvisionError,
+)
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.address import AddressReport
+from teds_provision.provisioning.agree import AgreeReport, AgreeResult, ResetReceipt
+from teds_provision.provisioning.identify import IdentifiedNode, ProvenNode
+from teds_provision.provisioning.locate import LocatedNode
+from teds_provision.provisioning.meeting import Arrival
+from teds_provision.provisioning.update import BoardUpdate, UpdatePlan
+from teds_provision.station.firmware import FirmwareReading, KnownFirmware
+
+from .shell import call
+from .test_datasheet_words import NFC, Work, both
+
+UUID, OTHER = bytes(range(10)), bytes(range(10, 20))
+NODE = UUID.hex()
+POINT = b"\x04" + bytes(64)
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any, str, Any], Work]:
+    def put(room: Any, name: str, result: Any) -> Work:
+        work = Work(result)
+        monkeypatch.setattr(room, name, work)
+        return work
+
+    return put
+
+
+# -- identify ----------------------------------------------------------------------------------------------------------
+
+
+def proven(uuid: bytes = UUID, **changes: Any) -> ProvenNode:
+    who = IdentifiedNode(uuid, POINT, bytes(64), NodeState.FACTORY, bytes.fromhex("04a2b3c4"), None, b"", None)
+    identity: Any = SimpleNamespace(epoch=3, sequence=7, can_address=0x21)
+    return replace(ProvenNode(who, identity, whitelisted=True, channels=4, name="thumb"), **changes)
+
+
+def arrival(found: ProvenNode | None, error: TedsProvisionError | None = None, uuid: bytes = UUID) -> Any:
+    return Arrival(uuid, "nfc:usb", 0.5, found, error)
+
+
+def test_a_tapped_board_is_shown_whole(home: Path, stand_in: Any) -> None:
+    charging = {"state": "charging", "text": "charging, 82 %", "battery_percent": 82}
+    one = proven(charging=charging, pressed=True, ble="C1:D8:57:00:01:01")
+    work = stand_in(provisioning.identify, "identify_at", [arrival(one)])
+    people, found = both(home, "identify", "--add", *NFC)
+    key = one.who.fingerprint
+    assert people.out == (
+        f"{NODE}  key {key[:16]}  factory  whitelisted  thumb  tag 04a2b3c4  charging, 82 %  says it was pressed\n"
+    )
+    assert found == {
+        "uuid": NODE,
+        "fingerprint": key,
+        "tag_uid": "04a2b3c4",
+        "state": "factory",
+        "whitelisted": True,
+        "channels": 4,
+        "name": "thumb",
+        "epoch": 3,
+        "sequence": 7,
+        "can_address": 0x21,
+        "charging": charging,
+        "ble": "C1:D8:57:00:01:01",
+        "firmware": None,
+        "pressed": True,
+    }
+    assert work.named["add"] is True
+    assert work.named["watch"] is False
+    bare = proven(name=None, whitelisted=False, firmware=KnownFirmware(FirmwareReading(None, False), "not-reported"))
+    work.result = [arrival(replace(bare, who=replace(bare.who, tag_uid=None)))]
+    people, found = both(home, "identify", *NFC)
+    assert people.out == (f"{NODE}  key {key[:16]}  factory  not whitelisted  firmware not reported (not verified)\n")
+    assert (found["tag_uid"], found["name"], found["charging"], work.named["add"]) == (None, None, None, False)
+    assert found["firmware"]["state"] == "not-reported"
+
+
+def test_of_several_nodes_the_first_is_on_top_and_all_are_listed(home: Path, stand_in: Any) -> None:
+    nodes = [proven(), proven(OTHER, name="index")]
+    stand_in(provisioning.identify, "identify_at", [arrival(node) for node in nodes])
+    people, found = both(home, "identify", *NFC)
+    assert [line.split()[0] for line in people.out.splitlines()] == [NODE, OTHER.hex()]
+    every = found.pop("nodes")
+    assert [node["uuid"] for node in every] == [NODE, OTHER.hex()]
+    assert found == every[0]
+
+
+def test_who_watches_gets_a_line_a_node_and_one_that_fails_ends_nothing(home: Path, stand_in: Any) -> None:
+    bad = arrival(None, NotAuthenticError("It cannot prove its key.", hint="Set it aside."), OTHER)
+    stand_in(provisioning.identify, "identify_at", [bad, arrival(proven())])
+    people = call(home, "identify", "--watch", *NFC)
+    assert (people.code, len(people.out.splitlines())) == (0, 1)
+    assert OTHER.hex() in people.err
+    assert "It cannot prove its key." in people.err
+    assert "→ Set it aside." in people.err
+    first, second = map(json.loads, call(home, "--json", "identify", "--watch", *NFC).out.splitlines())
+    assert first["error"] == {
+        "code": "not-authentic",
+        "message": "It cannot prove its key.",
+        "hint": "Set it aside.",
+    }
+    assert (first["uuid"], second["uuid"], "nodes" in second) == (OTHER.hex(), NODE, False)
+    assert {"time"} == second.keys() - set(found_keys())
+
+
+def found_keys() -> tuple[str, ...]:
+    return (
+        "uuid", "fingerprint", "tag_uid", "state", "whitelisted", "channels", "name", "epoch", "sequence",
+        "can_address", "charging", "ble", "firmware", "pressed",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("words", [["--locate"], ["--locate", "--watch"], ["--locate", "--dry-run"]])
+def test_locating_needs_a_person_and_boards_that_are_there(home: Path, words: list[str]) -> None:
+    outcome = call(home, "--json", "identify", *words, *NFC)
+    assert (outcome.code, outcome.json["error"]["message"].startswith("--locate ")) == (2, True)
+
+
+# -- agree, reset, address, locate -------------------------------------------------------------------------------------
+
+
+def test_what_agree_prints(home: Path, stand_in: Any) -> None:
+    work = stand_in(
+        provisioning.agree, "agree_at", AgreeReport(UUID, AgreeResult(epoch=2, key_id="22" * 8, fresh=True))
+    )
+    people, found = both(home, "agree", NODE, *NFC)
+    assert people.out == f"Node {NODE}: key {'22' * 8}, epoch 2.\n"
+    assert found == {"uuid": NODE, "epoch": 2, "key_id": "22" * 8, "fresh": True}
+    assert (work.named["rotate"], work.named["dry_run"], work.given[2]) == (False, False, NODE)
+    work.result = AgreeReport(UUID, AgreeResult(epoch=2, key_id="22" * 8, fresh=False))
+    assert call(home, "agree", NODE, *NFC).out == f"Node {NODE}: key {'22' * 8}, epoch 2 (nothing to do).\n"
+    work.result = AgreeReport(UUID, None, "agree", ("22" * 8, "33" * 8))
+    people, found = both(home, "agree", NODE, "--rotate", "--dry-run", *NFC)
+    assert people.out == f"Plan: agree ({'22' * 8}, {'33' * 8}).\n"
+    assert found == {"uuid": NODE, "plan": "agree", "held": ["22" * 8, "33" * 8]}
+    assert (work.named["rotate"], work.named["dry_run"]) == (True, True)
+    work.result = AgreeReport(UUID, None, "agree")
+    assert call(home, "agree", NODE, "--dry-run", *NFC).out == "Plan: agree (no key yet).\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "agreed"), [([], False), (["--yes"], False), (["--rotate"], False), (["--rotate", "--yes"], True)]
+)
+def test_another_stations_key_is_replaced_only_with_the_option_that_names_it(
+    home: Path, stand_in: Any, words: list[str], agreed: bool
+) -> None:
+    work = stand_in(provisioning.agree, "agree_at", AgreeReport(UUID, AgreeResult(1, "22" * 8, fresh=True)))
+    assert call(home, "agree", NODE, *words, *NFC).code == 0
+    if agreed:
+        work.named["confirm"]("Lock the other station out?")
+        return
+    with pytest.raises(PolicyError) as refused:
+        work.named["confirm"]("Lock the other station out?")
+    assert refused.value.hint == "Add --rotate --yes."
+    assert "Lock the other station out?" in refused.value.message
+
+
+def test_what_reset_prints(home: Path, stand_in: Any) -> None:
+    work = stand_in(provisioning.agree, "reset_at", ResetReceipt(4, b"\x11" * 16, b"\x22" * 64))
+    plan, found = both(home, "reset", NODE, "--dry-run", *NFC)
+    assert (plan.out, found) == (f"Plan: reset {NODE} to factory state.\n", {"uuid": NODE, "plan": "reset"})
+    refused = call(home, "--json", "reset", NODE, *NFC)
+    assert (refused.code, refused.json["error"]["hint"]) == (6, "Add --yes, or --dry-run to see the plan.")
+    assert work.given == []
+    people, found = both(home, "reset", NODE, "--yes", *NFC)
+    assert people.out == f"Node {NODE} is back in factory state and signed a receipt (epoch 4).\n"
+    assert found == {"uuid": NODE, "state": "factory", "epoch": 4, "challenge": "11" * 16, "proof": "22" * 64}
+
+
+@pytest.mark.parametrize(
+    ("text", "address"), [("1", 1), ("0x21", 0x21), ("239", 239), ("0xEF", 239), ("0", 0), ("240", 0), ("0xF1", 0),
+                          ("x", 0), ("-1", 0), ("2.0", 0)]
+)  # fmt: skip
+def test_a_can_address_is_1_to_239(home: Path, stand_in: Any, text: str, address: int) -> None:
+    work = stand_in(provisioning.address, "set_address_at", AddressReport(UUID, True))
+    outcome = call(home, "--json", "address", *NFC, "--", NODE, text)
+    assert outcome.code == (0 if address else 2)
+    if address:
+        assert (work.given[3], work.named) == (address, {"dry_run": False})
+        assert outcome.json == {"uuid": NODE, "can_address": address, "changed": True}
+    else:
+        assert work.given == []
+        assert "a CAN address is 1 to 239 (0x01 to 0xEF)." in outcome.json["error"]["message"]
+
+
+def test_what_address_prints(home: Path, stand_in: Any) -> None:
+    work = stand_in(provisioning.address, "set_address_at", AddressReport(UUID, True))
+    assert call(home, "address", NODE, "0x21", *NFC).out == f"Node {NODE} now has CAN address 0x21.\n"
+    work.result = AddressReport(UUID, False)
+    assert call(home, "address", NODE, "0x21", *NFC).out == f"Node {NODE} already has CAN address 0x21.\n"
+    work.result = AddressReport(UUID, None)
+    plan, found = both(home, "address", NODE, "33", "--dry-run", *NFC)
+    assert plan.out == f"Plan: change the CAN address of node {NODE} to 0x21.\n"
+    assert found == {"uuid": NODE, "plan": "address", "can_address": 33}
+    assert work.named == {"dry_run": True}
+
+
+@pytest.mark.parametrize(
+    ("words", "seconds"),
+    [
+        ([], 10), (["--for", "30s"], 30), (["--for", "5"], 5), (["--for", "60"], 60), (["--for", "1min"], 60),
+        (["--for", "10 s"], 10), (["--for", "0"], 0), (["--for", "61"], None), (["--for", "2min"], None),
+        (["--for", "soon"], None), (["--for", "1.5"], None), (["--for", "1h"], None),
+    ],
+)  # fmt: skip
+def test_a_board_blinks_for_ten_seconds_and_a_minute_at_most(
+    home: Path, stand_in: Any, words: list[str], seconds: int | None
+) -> None:
+    work = stand_in(provisioning.locate, "locate_at", [LocatedNode(UUID, "thumb")])
+    outcome = call(home, "locate", NODE, *words, *NFC)
+    if seconds is None:
+        assert (outcome.code, "0 to 60 seconds are expected" in outcome.err) == (2, True)
+        return
+    assert work.given[2:4] == [[NODE], seconds]
+    ends = f"blinks for {seconds} s." if seconds else "no longer blinks."
+    assert outcome.out == f"thumb ({NODE}) {ends}\n"
+    assert call(home, "--json", "locate", NODE, *words, *NFC).json == {"located": [{"uuid": NODE, "name": "thumb"}]}
+
+
+def test_a_board_that_does_not_blink_ends_the_command(home: Path, stand_in: Any) -> None:
+    stand_in(provisioning.locate, "locate_at", [(UUID, NoNodeError("No node answered."))])
+    assert call(home, "locate", NODE, *NFC).code == 5
+    stand_in(provisioning.locate, "locate_at", [LocatedNode(UUID, None)])
+    assert call(home, "locate", NODE, *NFC).out == f"Node ({NODE}) blinks for 10 s.\n"
+
+
+# -- update ------------------------------------------------------------------------------------------------------------
+
+IMAGE: Any = SimpleNamespace(
+    octets=bytes(7000), digest=bytes.fromhex("ab" * 32), version_text="1.4.0", version=(1, 4, 0, 0), board="finger/r1"
+)
+RUNS: Any = SimpleNamespace(version=(1, 3, 0), build=7, text="finger/app")
+
+
+@pytest.fixture
+def updating(home: Path, tmp_path: Path, stand_in: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return what runs an update with these plans and ends."""
+    file = tmp_path / "finger.bin"
+    file.write_bytes(b"image")
+    for uuid in (NODE, OTHER.hex(), "ab" * 10):
+        call(home, "whitelist", "add", uuid)
+    stand_in(firmware_image, "load_firmware_image", IMAGE)
+
+    def run(plans: dict[bytes, Any], ends: list[BoardUpdate], *words: str, as_json: bool = False) -> Any:
+        monkeypatch.setattr(
+            provisioning.update, "plan_or_refusal", lambda _station, _links, uuid, _order, _reporter: plans[uuid]
+        )
+        done = stand_in(provisioning.update, "update_boards", ends)
+        uuids = [uuid.hex() for uuid in plans]
+        outcome = call(home, *(["--json"] if as_json else []), "update", *uuids, file, *words, *NFC)
+        return outcome, done
+
+    return run
+
+
+def plan(uuid: bytes = UUID, **changes: Any) -> UpdatePlan:
+    return replace(UpdatePlan(uuid, RUNS, "upload", 7000, 3.5, ("ncap",)), **changes)
+
+
+def ended(result: Any, error: TedsProvisionError | None = None, uuid: bytes = UUID) -> BoardUpdate:
+    return BoardUpdate(uuid, result, "1.3.0+7", 7000, 12.3456, error)
+
+
+def lines_of(outcome: Any) -> list[Any]:
+    return [json.loads(line) for line in outcome.out.splitlines()]
+
+
+def test_the_plan_of_an_update_says_from_to_size_time_and_what_it_interrupts(updating: Any) -> None:
+    outcome, done = updating({UUID: plan()}, [], "--dry-run")
+    digest = "ab" * 32
+    assert (outcome.code, outcome.out.splitlines()) == (
+        0,
+        [
+            f"Plan for {NODE}: install 1.4.0 (image {digest}).",
+            "  now: 1.3.0+7, finger/app",
+            "  7000 octets, about 4 s if nothing else uses the link; this link is slow, keep the board where it is",
+            "  interrupts the measurement by ncap",
+        ],
+    )
+    assert done.given == []
+    [found] = lines_of(updating({UUID: plan(question="The image names no board.")}, [], "--dry-run", as_json=True)[0])
+    assert found == {
+        "uuid": NODE,
+        "plan": "upload",
+        "from": "1.3.0+7",
+        "to": "1.4.0",
+        "image": digest,
+        "octets": 7000,
+        "seconds": 3.5,
+        "interrupts": ["ncap"],
+        "question": "The image names no board.",
+    }
+
+
+def test_an_update_has_a_line_a_board_and_totals(updating: Any) -> None:
+    plans = {UUID: plan(), OTHER: plan(OTHER)}
+    outcome, done = updating(plans, [ended("updated"), ended("already", uuid=OTHER)], "--yes", as_json=True)
+    one, two, totals = lines_of(outcome)
+    assert outcome.code == 0
+    assert one == {
+        "uuid": NODE,
+        "from": "1.3.0+7",
+        "to": "1.4.0",
+        "image": "ab" * 32,
+        "octets": 7000,
+        "seconds": 12.346,
+        "result": "updated",
+    }
+    assert (two["uuid"], two["result"]) == (OTHER.hex(), "already")
+    seconds = totals["totals"].pop("seconds")
+    assert seconds >= 0
+    assert totals == {"totals": {"updated": 1, "already": 1, "reverted": 0, "refused": 0, "lost": 0}}
+    order = done.given[2][0][1]
+    assert (done.named["parallel"], order.wait, order.allow_downgrade, order.other_board) == (1, 180, False, False)
+    people, done = updating(plans, [ended("updated"), ended("already", uuid=OTHER)], "--yes", "--parallel", "4")
+    assert people.out.splitlines()[:2] == [
+        f"{NODE}  1.3.0+7 → 1.4.0  updated  12.3 s",
+        f"{OTHER.hex()}  1.4.0  already  12.3 s",
+    ]
+    assert people.out.splitlines()[2].startswith("1 updated, 1 already in ")
+    assert done.named["parallel"] == 4
+
+
+LOST, REFUSED, FORGED = BoardLostError("It is gone."), DowngradeError("It is older."), NotAuthenticError("Forged.")
+
+
+@pytest.mark.parametrize(
+    ("errors", "code"),
+    [
+        ([LOST, REFUSED, FORGED], 4),
+        ([LOST, REFUSED], 6),
+        ([LOST], 5),
+        ([REFUSED, LOST], 6),
+        ([StoreError("full"), LOST], 5),
+        ([StoreError("full")], 7),
+    ],
+)
+def test_the_worst_board_decides_how_updates_end(updating: Any, errors: list[TedsProvisionError], code: int) -> None:
+    uuids = [UUID, OTHER, bytes.fromhex("ab" * 10)][: len(errors)]
+    ends = [ended("refused", error, uuid) for uuid, error in zip(uuids, errors, strict=True)]
+    outcome, _ = updating({uuid: plan(uuid) for uuid in uuids}, ends, "--yes", as_json=True)
+    assert outcome.code == code
+    assert [line["error"]["message"] for line in lines_of(outcome)[:-1]] == [error.message for error in errors]
+
+
+def test_an_update_asks_unless_yes_answers_and_an_image_of_another_board_needs_its_own_option(updating: Any) -> None:
+    outcome, done = updating({UUID: plan()}, [ended("updated")], as_json=True)
+    assert (outcome.code, outcome.json["error"]["code"], done.given) == (6, "refused", [])
+    question = "The image names the board 'arm'; this board is 'finger/app'."
+    outcome, done = updating({UUID: plan(question=question)}, [], "--yes", as_json=True)
+    refused, _ = lines_of(outcome)
+    assert (outcome.code, refused["result"], refused["error"]) == (
+        6,
+        "refused",
+        {
+            "code": "wrong-image",
+            "message": question,
+            "hint": "If it is the right one all the same: --other-board",
+        },
+    )
+    assert done.given[2] == []
+    outcome, done = updating(
+        {UUID: plan(question=question)}, [ended("updated")], "--yes", "--other-board", as_json=True
+    )
+    assert (outcome.code, done.given[2][0][1].other_board) == (0, True)
+    outcome, done = updating({UUID: plan(stage="nothing", octets=0)}, [ended("already")], as_json=True)
+    assert outcome.code == 0, "nothing to do: nothing is asked"
+
+
+def test_a_dry_run_of_several_boards_counts_them(updating: Any) -> None:
+    plans = {UUID: plan(), OTHER: plan(OTHER, stage="nothing", octets=0, seconds=0.0)}
+    outcome, _ = updating(plans, [], "--dry-run", as_json=True)
+    assert lines_of(outcome)[-1] == {
+        "totals": {
+            "planned": 1, "updated": 0, "already": 1, "reverted": 0, "refused": 0, "lost": 0,
+            "octets": 7000, "seconds": 3.5,
+        },
+    }  # fmt: skip
+    people, _ = updating(plans, [], "--dry-run")
+    assert people.out.splitlines()[-1] == "1 planned, 1 already; 7000 octets, about 4 s one board after the other"
+
+
+@pytest.mark.parametrize("words", [[], ["--match", "all"]])
+def test_an_update_is_of_boards_or_of_those_that_match(home: Path, tmp_path: Path, words: list[str]) -> None:
+    file = tmp_path / "finger.bin"
+    file.write_bytes(b"image")
+    boards = [NODE] if words else []
+    assert call(home, "--json", "update", *boards, file, *words, *NFC).code == 2
