@@ -580,7 +580,10 @@ REQUIRED = {
     0: ("reserved 0", []),
     1: ("MetaTEDS", ["UUID", "OholdOff", "TestTime", "MaxChan"]),
     2: ("MetaIdTEDS", ["NumLang", "DirBlock", "SubSum"]),
-    3: ("ChanTEDS", ["CalKey", "ChanType", "PhyUnits", "LowLimit", "HiLimit", "OError", "SelfTest", "Sample"]),
+    3: (
+        "ChanTEDS",
+        ["CalKey", "ChanType", "PhyUnits", "LowLimit", "HiLimit", "OError", "SelfTest", "Sample", "Sampling"],
+    ),
     4: ("ChanIdTEDS", ["NumLang", "DirBlock", "SubSum"]),
     5: ("CalTEDS", []),
     6: ("CalIdTEDS", ["NumLang", "DirBlock", "SubSum"]),

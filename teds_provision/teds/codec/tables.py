@@ -285,7 +285,7 @@ CHANNEL: Final = (
     _seconds(28, "InPropDl", "O", "incoming propagation delay"),
     _seconds(29, "OutPropD", "O", "outgoing propagation delay"),
     _seconds(30, "TSError", "O", "trigger-to-sample delay uncertainty"),
-    _row(31, "Sampling", "tlv", "R?", children=_SAMPLING, meaning="sampling attributes"),
+    _row(31, "Sampling", "tlv", "R", children=_SAMPLING, meaning="sampling attributes"),
     _row(32, "DataXmit", "u8", enumeration=DATA_XMIT, meaning="data transmission capability"),
     _row(33, "Buffered", "u8", meaning="buffered attribute (enumeration not available)"),
     _row(34, "EndOfSet", "u8", meaning="end-of-data-set operation (enumeration not available)"),

@@ -1,0 +1,308 @@
+"""Every row of the standard's tables as they stand in the format study, by hand: numbers, names, types, octets, needs.
+
+Nothing here is computed from the tables that it holds.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision import teds
+from teds_provision.teds.codec import tables
+from teds_provision.teds.codec.model import ONLY_2024, TEXT_BASED
+
+# Type, name, kind of value, need; the sub-fields of a structure follow it, indented.
+META = """
+4 UUID uuid R
+10 OholdOff f32 R
+11 SHoldOff f32 O
+12 TestTime f32 R
+13 MaxChan u16 R
+14 CGroup tlv O repeats
+  20 GrpType u8 O
+  21 MemList u16[] O
+15 VGroup tlv O repeats
+  20 GrpType u8 O
+  21 MemList u16[] O
+16 GeoLoc tlv O repeats
+  24 LocEnum u8 O
+  20 GrpType u8 O
+  21 MemList u16[] O
+17 Proxies tlv O repeats
+  22 ChanNum u16 O also 1
+  23 Organiz u8 O
+  21 MemList u16[] O
+"""
+UNITS = """
+  50 UnitType u8 O
+  51 Radians u8 O
+  52 SterRad u8 O
+  53 Meters u8 O
+  54 Kilogram u8 O
+  55 Seconds u8 O
+  56 Amperes u8 O
+  57 Kelvins u8 O
+  58 Moles u8 O
+  59 Candelas u8 O
+  60 UnitsExt u8 O
+"""
+CHANNEL = f"""
+10 CalKey u8 R
+11 ChanType u8 R
+12 PhyUnits units R
+{UNITS}
+13 LowLimit f32 R
+14 HiLimit f32 R
+15 OError f32 R
+16 SelfTest u8 R
+17 MRange u8 O
+18 Sample tlv R
+  40 DatModel u8 R
+  41 ModLenth u8 R
+  42 SigBits u16 R also 1
+19 DataSet tlv O
+  43 Repeats u16 O also 1
+  44 SOrigin f32 O
+  45 StepSize f32 O
+  46 SUnits units O
+  47 PreTrigg u16 O also 1
+20 UpdateT f32 R?
+21 WSetupT f32 O
+22 RSetupT f32 R?
+23 SPeriod f32 R?
+24 WarmUpT f32 R?
+25 RDelayT f32 R?
+26 TestTime f32 O
+27 TimeSrc u8 O
+28 InPropDl f32 O
+29 OutPropD f32 O
+30 TSError f32 O
+31 Sampling tlv R
+  48 SampMode u8 R
+  49 SDefault u8 O
+32 DataXmit u8 O
+33 Buffered u8 O
+34 EndOfSet u8 O
+35 EdgeRpt u8 O
+36 ActHalt u8 O
+37 Directon f32 O
+38 DAngles f32x2 O
+39 ESOption u8 O
+"""
+NAME = """
+4 Format u8 R
+5 TCName text R
+"""
+PHY = "\n".join(
+    (
+        "10 Radio u8 R?",
+        "11 MaxBPS u32 R?",
+        "12 MaxCDev u16 R?",
+        "13 MaxRDev u16 R?",
+        "14 Encrypt u16 O",
+        "15 Authent u8 O",
+        "16 MinKeyL u16 O",
+        "17 MaxKeyL u16 O",
+        "18 MaxSDU u16 O",
+        "19 MinALat u32 O",
+        "20 MinTLat u32 O",
+        "21 MaxXact u8 O",
+        "22 Battery u8 O",
+        "23 RadioVer u16 O",
+        "24 MaxRetry u16 O",
+        *(f"{n} Bluetooth{n} octets O" for n in range(32, 42)),
+        *(f"{n} WiFi{n} octets O" for n in range(48, 55)),
+        *(f"{n} ZigBee{n} octets O" for n in range(64, 81)),
+        *(f"{n} LoWPAN{n} octets O" for n in range(96, 104)),
+    )
+)
+TEXT = """
+10 NumLang u8 R
+11 DirBlock tlv R repeats
+  20 LangCode lang O
+  21 Offset u32 O
+  22 Length u32 O
+  23 Compress u8 O
+12 SubSum u16 R
+"""
+CALIBRATION = """
+10 LstCalDt instant O
+11 CalInrvl duration O
+12 SIConvrt tlv O
+  30 Slope f32 O
+  31 Intercept f32 O
+13 LowLimit f32 O
+14 HiLimit f32 O
+15 OError f32 O
+16 LinOnly f32[] O
+"""
+SEED = """
+1 UsedSecScheme u8 R
+2 UsedVerAlg u8 R
+3 UsedEncAlg u8 R
+4 UsedHashAlg u8 R
+5 CA text O
+6 LastModified instant O
+100 Signature key O
+101 NodePublicKey key O
+102 SigNodePublicKey key O
+103 BaseStationPublicKey key O
+104 SigBaseStationPublicKey key O
+105 ProfileVersion u8 O
+106 Sequence u32 O
+107 KeyEpoch u32 O
+108 SignedBlock block id O repeats
+109 SessionSuite u8 O
+110 KeyAgreement u8 O
+"""
+LEVEL = """
+10 Level text R
+11 NumOfStandards u8 R
+"""
+
+
+def lines(rows: tuple[tables.FieldSpec, ...], indent: str = "") -> list[str]:
+    """A table as it is written above."""
+    written = []
+    for row in rows:
+        words = [f"{indent}{row.type}", row.name, row.kind, row.need]
+        words += ["repeats"] if row.repeats else []
+        words += [f"also {', '.join(map(str, row.also))}"] if row.also else []
+        written.append(" ".join(words))
+        if row.name != "SUnits":  # the same sub-fields as PhyUnits, held there
+            written += lines(row.children, "  ")
+    return written
+
+
+@pytest.mark.parametrize(
+    ("access_code", "written"),
+    [
+        (1, META), (2, TEXT), (3, CHANNEL), (4, TEXT), (6, TEXT), (7, ""), (8, ""), (9, ""), (10, TEXT), (11, TEXT),
+        (12, NAME), (13, PHY), (14, TEXT), (15, TEXT), (16, LEVEL), (17, ""), (128, SEED), (0, ""), (18, ""), (129, ""),
+    ],
+)  # fmt: skip
+def test_each_row_is_the_standards(access_code: int, written: str) -> None:
+    assert lines(teds.table(access_code).rows) == [line for line in written.split("\n") if line]
+
+
+def test_the_calibration_rows_from_memory_are_below_the_house_profile() -> None:
+    rows = tuple(row for row in teds.table(5).rows if row.type < 128)
+    assert lines(rows) == CALIBRATION.strip().split("\n")
+    assert min(row.type for row in teds.table(5).rows if row not in rows) == 128
+
+
+def test_both_units_have_the_same_sub_fields() -> None:
+    channel = teds.table(3)
+    assert channel.by_name["PhyUnits"].children == channel.by_name["DataSet"].by_name["SUnits"].children
+
+
+def test_octets_of_each_kind_of_value() -> None:
+    kinds = ("u8", "u16", "u32", "f32", "f32x2", "lang", "instant", "duration", "block id", "text", "u16[]", "units")
+    found = {kind: teds.FieldSpec(1, "x", kind).octets for kind in kinds}
+    assert found == {
+        "u8": (1,), "u16": (2,), "u32": (4,), "f32": (4,), "f32x2": (8,), "lang": (2,), "instant": (8, 10),
+        "duration": (8,), "block id": (35,), "text": (), "u16[]": (), "units": (),
+    }  # fmt: skip
+
+
+def test_names_of_the_access_codes() -> None:
+    assert [teds.name_of(code) for code in (*range(19), 127, 128, 129, 130, 131, 132, 255)] == [
+        "reserved 0", "MetaTEDS", "MetaIdTEDS", "ChanTEDS", "ChanIdTEDS", "CalTEDS", "CalIdTEDS", "EUASTEDS",
+        "FreqRespTEDS", "TransferTEDS", "CommandTEDS", "TitleTEDS", "XdcrName", "PHYTEDS", "GeoLocTEDS",
+        "UnitsExtention", "SecurityTEDS2024", "TimeSyncTEDS", "reserved 18", "reserved 127", "SecurityTEDS",
+        "manufacturer 129", "OriginTEDS", "CertificateTEDS", "manufacturer 132", "manufacturer 255",
+    ]  # fmt: skip
+    assert {2, 4, 6, 10, 11, 14, 15} == TEXT_BASED
+    assert {16, 17} == ONLY_2024
+    assert {code: teds.table(code).family for code in (1, 3, 5, 10, 12, 13, 16, 128)} == {
+        1: 0, 3: 0, 5: 0, 10: 0, 12: 0, 13: 5, 16: 0, 128: 0,
+    }  # fmt: skip
+    assert [code for code in (1, 2, 3, 5, 12, 13, 16, 128) if not teds.table(code).verified] == [5, 16]
+
+
+NOT_APPLICABLE = "not applicable"
+ENUMERATIONS = {
+    (3, "CalKey"): {
+        0: "CAL_NONE", 1: "CAL_SUPPLIED", 3: "CAL_CUSTOM", 4: "TIM_CAL_SUPPLIED", 5: "TIM_CAL_SELF",
+        6: "TIM_CAL_CUSTOM",
+    },
+    (3, "ChanType"): {0: "sensor", 1: "actuator", 2: "event sensor"},
+    (3, "UnitType"): {
+        0: "product of SI units", 1: "ratio of a unit to itself", 2: "log10 of the product", 3: "log10 of the ratio",
+        4: "digital data", 5: "arbitrary",
+    },
+    (3, "SelfTest"): {0: "none", 1: "provided"},
+    (3, "DatModel"): {
+        0: "unsigned integer", 1: "Float32", 2: "Float64", 3: "fraction", 4: "bit sequence", 5: "long integer",
+        6: "long fraction", 7: "time of day",
+    },
+    (3, "DataXmit"): {
+        1: "on command", 2: "command or buffer full", 3: "command or interval", 4: "command, buffer or interval",
+        5: "buffer full", 6: "interval", 7: "buffer or interval",
+    },
+    (3, "EdgeRpt"): {
+        0: NOT_APPLICABLE, 1: "rising", 2: "falling", 3: "both", 5: "selectable, default rising",
+        6: "selectable, default falling", 7: "selectable, default both",
+    },
+    (3, "ActHalt"): {0: NOT_APPLICABLE, 1: "halt at once", 2: "halt at end of data set", 3: "ramp"},
+    (3, "ESOption"): {
+        0: NOT_APPLICABLE, 1: "not changeable", 2: "changeable, inconsistencies detected",
+        3: "changeable, inconsistencies not detected",
+    },
+    (12, "Format"): {0: "user defined", 1: "text-based"},
+    (13, "Radio"): {0: "IEEE 802.11", 1: "Bluetooth", 2: "ZigBee", 3: "6LoWPAN", 255: "manufacturer"},
+    (128, "UsedSecScheme"): {
+        0: "NoSec", 1: "AsVerification", 2: "DataEncryption", 3: "CommEncryption", 4: "AsVerAndData",
+    },
+    (128, "UsedVerAlg"): {0: "RSA", 1: "DSA", 2: "ECDSA", 3: "ElGamal", 4: "ECDH"},
+    (128, "UsedEncAlg"): {0: "AES-128", 1: "AES-256", 2: "RC4", 3: "DES", 4: "Blowfish"},
+    (128, "UsedHashAlg"): {0: "MD5", 1: "SHA-256", 2: "SHA-512"},
+    (128, "SessionSuite"): {1: "AES-128-CCM alone (never fielded)", 2: "one-time ECDH, AES-128-CCM"},
+    (128, "KeyAgreement"): {1: "static keys of both (never fielded)", 2: "one-time keys, node signs"},
+}  # fmt: skip
+
+
+def test_every_enumeration_has_its_numbers() -> None:
+    found = {}
+    for access_code in (1, 3, 10, 12, 13, 16, 128):
+        table = teds.table(access_code)
+        for row in (*table.rows, *table.inner.values()):
+            if row.enumeration:
+                found[access_code, row.name] = dict(row.enumeration)
+    assert found == ENUMERATIONS
+    assert tables.LEVELS == {
+        "A": "encryption", "B": "authentication", "C": "encryption and authentication",
+        "D": "authentication and authorization", "E": "all", "N": "none",
+    }  # fmt: skip
+
+
+def test_what_is_weak_or_protects_nothing_is_marked() -> None:
+    """No security; DSA, ElGamal; RC4, DES, Blowfish; MD5."""
+    weak = {row.name: set(row.weak) for row in teds.table(128).rows if row.weak}
+    assert weak == {"UsedSecScheme": {0}, "UsedVerAlg": {1, 3}, "UsedEncAlg": {2, 3, 4}, "UsedHashAlg": {0}}
+
+
+def test_a_wrong_number_is_an_error_where_the_sources_agree_and_a_warning_elsewhere() -> None:
+    """H: interpretation, ChanType, SelfTest, DatModel. The codes of CalKey, EdgeRpt and the rest have one source."""
+    table = teds.table(3)
+    sure = [
+        row.name
+        for row in (*table.rows, *table.inner.values())
+        if row.enumeration and row.enumeration_confidence == "H"
+    ]
+    assert sure == ["ChanType", "SelfTest", "UnitType", "DatModel"]
+
+
+def test_names_in_the_numbering_of_the_text_are_read_as_well() -> None:
+    """4 and 5 are written; 10 and 11 of the clause's text are read."""
+    aliases = teds.table(12).aliases
+    assert {number: (row.name, row.kind) for number, row in aliases.items()} == {
+        10: ("Format", "u8"),
+        11: ("TCName", "text"),
+    }
+    octets = teds.compose(12, {"Format": 0, "TCName": "bench"})
+    assert [(field.type, field.name) for field in teds.decode(octets).fields] == [
+        (3, "TEDSID"),
+        (4, "Format"),
+        (5, "TCName"),
+    ]
