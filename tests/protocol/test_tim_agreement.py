@@ -205,8 +205,10 @@ def test_the_station_refuses_a_key_that_is_not_signed_for_this_uuid_in_the_agree
     desk.memory.state = replace(desk.flash, node_key_signature=elsewhere)
     desk.restart()
     agreement = StationAgreement(CREDENTIALS, UUID)
-    with pytest.raises(NotAuthenticError, match="field 102"):
-        agreement.accept(desk.plain(agreement.request()).payload, desk.flash.security_teds(), pinned=None, epoch=0)
+    reply = desk.plain(agreement.request()).payload
+    for pinned in (None, fingerprint(NODE.point)):
+        with pytest.raises(NotAuthenticError, match="field 102"):
+            agreement.accept(reply, desk.flash.security_teds(), pinned=pinned, epoch=0)
 
 
 # -- the station's half: the order of its checks -----------------------------------------------------------------------

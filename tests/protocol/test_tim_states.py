@@ -373,6 +373,14 @@ def test_confirm_and_reset_end_every_session_on_every_link() -> None:
     assert desk.plain(other.seal(COMMANDS["identify"]), link="can:f1") == refusal(Reason.WRONG_STATE)
 
 
+def test_confirm_ends_every_half_open_open_too() -> None:
+    desk = Desk().agree().open(link="can:f2")
+    half_open = desk.session
+    desk.agree()
+    assert half_open is not None
+    assert desk.plain(half_open.seal(COMMANDS["identify"]), link="can:f2") == refusal(Reason.WRONG_STATE)
+
+
 def test_the_last_counter_is_served_and_ends_the_session() -> None:
     desk = Desk().agree().open()
     session = desk.session
