@@ -1,0 +1,382 @@
+"""``provision`` and ``verify UUID``: what they print for one board, for many and of a plan, and their exit codes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision import provisioning
+from teds_provision.errors import (
+    NodeSilentError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    TedsProvisionError,
+    UnprovenError,
+)
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.batch import ProvisionPlan, ProvisionRequest
+from teds_provision.provisioning.batch_sheet import BatchTotals, BoardResult, DeclinedError
+from teds_provision.provisioning.build import UnrequestedChangeError
+from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.provisioning.image_file import VerifyReport
+from teds_provision.provisioning.progress import NOTHING, StepResult
+from teds_provision.provisioning.provision import ProvisionResult
+from teds_provision.shapes.verdict import Check, Verification
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+
+from .shell import Outcome, call
+from .test_datasheet_words import NFC
+
+UUID, OTHER, THIRD = bytes(range(10)), bytes(range(10, 20)), bytes(range(20, 30))
+NODE = UUID.hex()
+POINT = b"\x04" + bytes(64)
+WHO = IdentifiedNode(UUID, POINT, bytes(64), NodeState.PROVISIONED, None, 0x21, b"", None)
+IMAGE = Image(UUID, load_profile("gripper").build(UUID, name="hand").blocks)
+GOOD = Verification(UUID, (Check("signed", "passed"), Check("session", "passed", "epoch 1")))
+FORGED = Verification(UUID, (Check("signature", "failed", "the signature does not verify"),))
+FORCE = {"channel": 3, "name": "grip force", "value": 2.5, "unit": "N", "valid": True,
+         "shown": {"value": 2.5, "unit": "N"}}  # fmt: skip
+DONE = ProvisionResult(
+    WHO,
+    (StepResult("identify", seconds=0.25, detail="x"), StepResult("agree", NOTHING, 0.0)),
+    IMAGE,
+    GOOD,
+    ("The battery is low.",),
+    (FORCE,),
+)
+AT = "2026-11-22T10:00:00Z"
+
+
+def board(
+    uuid: bytes = UUID, *, error: TedsProvisionError | None = None, row: int | None = None, **more: Any
+) -> BoardResult:
+    done = None if error is not None else replace(DONE, who=replace(WHO, uuid=uuid))
+    return BoardResult(uuid, 1.23456, more.get("done", done), error, row, "nfc:usb", AT)
+
+
+class Run:
+    """Stands for the work on boards: what ended, and how."""
+
+    def __init__(self, boards: list[BoardResult] | None = None, **more: Any) -> None:
+        self.boards, self.request = boards or [], ProvisionRequest()
+        self.warnings: tuple[str, ...] = ()
+        self.line, self.of_a_job, self.expected, self.ended, self.unlocked = None, False, 0, 0, False
+        self.stop = SimpleNamespace(request_stop=lambda: None)
+        self.board_warnings: dict[str, list[bytes]] = {}
+        self.planned: list[Any] = []
+        self.worst: TedsProvisionError | None = None
+        self.sum = BatchTotals(1, 0, 0, 3.5, 1.0, {"identify": 0.25})
+        self.failure: TedsProvisionError | None = None
+        vars(self).update(more)
+
+    def __len__(self) -> int:
+        return 0
+
+    def unlock(self) -> None:
+        self.unlocked = True
+
+    def one(self, _operator: Any) -> ProvisionResult:
+        if self.failure is not None:
+            raise self.failure
+        done = self.boards[0].done
+        assert done is not None
+        return done
+
+    def many(self, operator: Any) -> Iterator[BoardResult]:
+        self.operator = operator
+        for number, one in enumerate(self.boards, 1):
+            self.ended = number
+            yield one
+
+    def plan(self) -> Any:
+        return self.planned[0]
+
+    def plans(self) -> Iterator[Any]:
+        for one in self.planned:
+            self.ended += not isinstance(one, ProvisionPlan)
+            yield one
+
+    def totals(self) -> BatchTotals:
+        return self.sum
+
+
+@pytest.fixture
+def running(home: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Outcome, Run]]:
+    def run(boards: Run, *words: object, as_json: bool = False) -> tuple[Outcome, Run]:
+        def begin(_station: Any, links: Any, request: ProvisionRequest, _reporter: Any, *, line: Any) -> Run:
+            assert line is None
+            boards.request, boards.links = request, links  # type: ignore[attr-defined]
+            return boards
+
+        monkeypatch.setattr(provisioning.batch, "BatchRun", begin)
+        return call(home, *(["--json"] if as_json else []), "provision", *words, *NFC), boards
+
+    return run
+
+
+def lines_of(outcome: Outcome) -> list[Any]:
+    return [json.loads(line) for line in outcome.out.splitlines()]
+
+
+MEMBERS = {
+    "uuid": NODE,
+    "fingerprint": WHO.fingerprint,
+    "name": "hand",
+    "channels": [
+        {"number": 1, "name": "opening set point", "unit": "m", "range": "0 m to 0.11 m", "calibrated": False},
+        {"number": 2, "name": "opening", "unit": "m", "range": "0 m to 0.11 m", "calibrated": False},
+        {"number": 3, "name": "grip force", "unit": "N", "range": "0 N to 140 N", "calibrated": False},
+    ],
+    "steps": [
+        {"name": "identify", "result": "done", "seconds": 0.25},
+        {"name": "agree", "result": "nothing to do", "seconds": 0.0},
+    ],
+    "sample": [{"channel": 3, "value": 2.5, "unit": "N", "valid": True, "shown": {"value": 2.5, "unit": "N"}}],
+    "verdict": "authentic",
+    "warnings": ["The battery is low."],
+    "firmware": None,
+}
+
+
+def test_one_board_is_reported_whole(running: Any) -> None:
+    words = ("8d4d", "--profile", "gripper", "--name", "hand", "--calibration", "2=cell.csv", "--retype", "--yes")
+    outcome, run = running(Run([board()]), *words, as_json=True)
+    assert (outcome.code, outcome.err) == (0, "Warning: The battery is low.\n")
+    assert outcome.json == MEMBERS
+    order, request = run.request.order, run.request
+    assert (order.profile, order.name, order.calibration, order.channel) == ("gripper", "hand", Path("cell.csv"), 2)
+    assert (order.retype, order.drop_calibration, order.adopt) == (True, False, False)
+    assert (request.node, request.watch, request.whole_bus, request.sheet) == ("8d4d", False, False, None)
+    people, _ = running(Run([board()]))
+    assert people.out.splitlines() == [
+        "node       hand",
+        f"UUID       {NODE}",
+        f"key        {WHO.fingerprint[:16]}",
+        "channel 1  opening set point  0 m to 0.11 m",
+        "channel 2  opening  0 m to 0.11 m",
+        "channel 3  grip force  0 N to 140 N, reads 2.5 N",
+        "verdict    authentic",
+    ]
+
+
+def test_a_board_that_is_not_authentic_is_reported_with_its_error(running: Any) -> None:
+    bad = board(done=replace(DONE, verified=FORGED))
+    outcome, _ = running(Run([bad]), as_json=True)
+    found = outcome.json
+    assert outcome.code == 4
+    assert (found["verdict"], found["uuid"]) == ("not authentic", NODE)
+    assert found["error"]["code"] == "not-authentic"
+    assert "the signature does not verify" in found["error"]["message"]
+
+
+def test_changes_that_nobody_named_are_listed_with_the_refusal(running: Any) -> None:
+    change: Any = SimpleNamespace(text="Channel 1: the range becomes 0 to 80 mm.")
+    refusal = UnrequestedChangeError("It would change.", (change,), hint="Name it.")
+    outcome, _ = running(Run(failure=refusal), as_json=True)
+    assert (outcome.code, outcome.json) == (
+        6,
+        {"changes": [change.text], "error": {"code": "not-named", "message": "It would change.", "hint": "Name it."}},
+    )
+    people, _ = running(Run(failure=refusal))
+    assert (people.code, people.out) == (6, f"  {change.text}\n")
+
+
+SILENT = NodeSilentError("It is silent.", hint="Put it back.")
+
+
+@pytest.mark.parametrize(
+    ("words", "request_of", "totals"),
+    [
+        (["--watch"], (True, False, False), False),
+        (["--batch", "boards.csv"], (False, False, True), True),
+        (["--batch", "boards.csv", "--watch"], (True, False, True), True),
+        (["--all"], (False, True, False), True),
+    ],
+)
+def test_of_many_boards_each_has_a_line_and_the_sum_is_the_last(
+    running: Any, words: list[str], request_of: tuple[bool, bool, bool], totals: bool
+) -> None:
+    boards = [board(row=1), board(OTHER, error=SILENT, row=2), board(THIRD, error=DeclinedError("No."))]
+    failed = replace(BatchTotals(1, 1, 1, 3.5, 0.5, {"identify": 0.25}), worst=SILENT)
+    outcome, run = running(Run(boards, sum=failed), *words, "--yes", as_json=True)
+    request = run.request
+    assert (request.watch, request.whole_bus, request.sheet is not None) == request_of
+    assert run.unlocked
+    first, second, third, *last = lines_of(outcome)
+    assert first == MEMBERS | {"row": 1, "time": AT, "seconds": 1.235}
+    assert second == {
+        "uuid": OTHER.hex(),
+        "time": AT,
+        "row": 2,
+        "seconds": 1.235,
+        "error": {"code": "node-silent", "message": "It is silent.", "hint": "Put it back."},
+    }
+    assert ("row" in third, third["error"]["code"]) == (False, "declined")
+    if not totals:
+        assert (last, outcome.code) == ([], 0)
+        return
+    hint = "Run the same command again to continue with the rest."
+    assert (outcome.code, last) == (
+        5,
+        [
+            {
+                "totals": {
+                    "passed": 1, "failed": 1, "skipped": 1, "seconds": 3.5, "first_pass": 0.5,
+                    "steps": {"identify": 0.25},
+                },
+                "error": {"code": "node-silent", "message": "1 passed, 1 failed, 1 skipped.", "hint": hint},
+            }
+        ],
+    )  # fmt: skip
+
+
+def test_the_sum_of_a_batch_for_people(running: Any) -> None:
+    outcome, _ = running(Run([board(row=1)]), "--batch", "boards.csv", "--yes")
+    assert outcome.code == 0
+    assert outcome.out.splitlines()[-2:] == [
+        "1 passed, 0 failed, 0 skipped, 100.0% at the first attempt, 3.5 s in total.",
+        "  identify      0.25 s",
+    ]
+    none = BatchTotals(0, 0, 0, 0.0, None, {})
+    people, _ = running(Run(sum=none), "--batch", "boards.csv", "--yes")
+    assert people.out == "0 passed, 0 failed, 0 skipped, 0.0 s in total.\n"
+
+
+def test_boards_of_a_bus_have_a_line_each_and_warnings_are_printed_once(running: Any) -> None:
+    boards = [board(), board(OTHER, error=SILENT)]
+    warnings = {"The battery is low.": [UUID, OTHER], "The calibration is old.": [UUID]}
+    failed = replace(BatchTotals(1, 1, 0, 3.5, 0.5, {}), worst=SILENT)
+    run = Run(boards, expected=200, sum=failed, board_warnings=warnings)
+    outcome, _ = running(run, "--all", "--yes")
+    assert outcome.code == 5
+    assert outcome.out.splitlines() == [
+        f"  1 of 200  {NODE}  hand  authentic  1.2 s",
+        f"  2 of 200  {OTHER.hex()}  (no name)  failed  1.2 s",
+        "1 passed, 1 failed, 0 skipped, 50.0% at the first attempt, 3.5 s in total.",
+    ]
+    assert f"{OTHER.hex()}: It is silent.\n  → Put it back.\n" in outcome.err
+    assert outcome.err.count("Warning: All 2 boards: The battery is low.") == 1
+    assert outcome.err.count("The calibration is old.") == 1
+
+
+def test_yes_adds_no_strangers_of_a_bus(running: Any) -> None:
+    who: Any = SimpleNamespace(uuid=UUID, fingerprint="ab" * 32)
+    _, run = running(Run([]), "--all", "--yes")
+    with pytest.raises(NotWhitelistedError):
+        run.operator.accept(who)
+    _, run = running(Run([]), "--watch", "--yes")
+    run.operator.accept(who)
+
+
+PLAN = ProvisionPlan(
+    UUID, NodeState.FACTORY, ("identify", "whitelist", "agree"), ("The name becomes hand.",), ("A warning.",)
+)
+
+
+def test_a_plan_has_its_steps_changes_and_warnings(running: Any) -> None:
+    outcome, run = running(Run(planned=[PLAN]), "--dry-run", as_json=True)
+    assert (outcome.code, run.unlocked, outcome.json) == (
+        0,
+        False,
+        {
+            "uuid": NODE,
+            "state": "factory",
+            "plan": ["identify", "whitelist", "agree"],
+            "changes": ["The name becomes hand."],
+            "warnings": ["A warning."],
+        },
+    )
+    people, _ = running(Run(planned=[replace(PLAN, changes=())]), "--dry-run")
+    assert people.out == f"Plan for {NODE} (factory): identify, whitelist, agree.\n  no changes\n"
+    assert people.err == "Warning: A warning.\n"
+
+
+def test_the_plans_for_a_bus_are_counted_and_the_worst_refusal_ends_them(running: Any) -> None:
+    refused = board(OTHER, error=NotAuthenticError("Forged."))
+    plans = [PLAN, refused]
+    outcome, _ = running(Run(planned=plans, worst=refused.error), "--all", "--dry-run", as_json=True)
+    one, two, totals = lines_of(outcome)
+    assert (outcome.code, one["uuid"], two["error"]["message"]) == (4, NODE, "Forged.")
+    assert totals == {"totals": {"planned": 1, "failed": 1}}
+    for planned, words in (([PLAN], "1 node"), ([PLAN, PLAN], "2 nodes"), ([], "No nodes")):
+        people, _ = running(Run(planned=planned), "--all", "--dry-run")
+        assert people.out.splitlines()[-1] == f"{words} would be provisioned."
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--adopt", "--batch", "boards.csv"],
+        ["--operator", "Ann"],
+        ["--firmware-key", "owner.pem"],
+        ["--firmware", "a.bin", "--dry-run"],
+        ["--firmware", "a.bin", "--watch"],
+        ["--firmware", "a.bin", "--all"],
+        ["--item", "as-left"],
+        ["--due", "2027-10-31"],
+    ],
+)
+def test_options_of_provision_that_do_not_go_together(running: Any, words: list[str]) -> None:
+    outcome, run = running(Run([board()]), *words, as_json=True)
+    assert (outcome.code, run.unlocked) == (2, False)
+
+
+# -- verify UUID -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("verified", "error", "code"),
+    [
+        (GOOD, None, 0),
+        (FORGED, NotAuthenticError("It is forged."), 4),
+        (Verification(UUID, (Check("session", "failed", "no session"),)), UnprovenError("Nothing is proven."), 5),
+    ],
+)
+def test_what_verify_prints_of_a_node(
+    home: Path, monkeypatch: pytest.MonkeyPatch, verified: Verification, error: TedsProvisionError | None, code: int
+) -> None:
+    given: list[Any] = []
+
+    def verify(*words: Any, **more: Any) -> VerifyReport:
+        given.append((words[2], more))
+        return VerifyReport(verified, ("A warning.",), error)
+
+    monkeypatch.setattr(provisioning.verify_node, "verify_at", verify)
+    people = call(home, "verify", NODE, "--accept-firmware", *NFC)
+    assert people.code == code
+    width = max(len(check.name) for check in (*verified.checks, Check("check", "passed")))
+    assert people.out.splitlines() == [
+        f"{'check':<{width}}  result  found",
+        *(f"{check.name:<{width}}  {check.result}  {check.why}".rstrip() for check in verified.checks),
+        f"{NODE}: {verified.verdict}",
+    ]
+    assert "Warning: A warning." in people.err
+    assert given == [(NODE, {"accept_calibration": None, "accept_firmware": True, "is_node": True})]
+    outcome = call(home, "--json", "verify", NODE, "--accept-calibration", "it is so", *NFC)
+    found = outcome.json
+    assert (outcome.code, found.pop("error", {}).get("message")) == (code, error and error.message)
+    assert found == {
+        "uuid": NODE,
+        "scope": "node",
+        "verdict": verified.verdict,
+        "checks": [{"name": name, "result": result, "why": why} for name, result, why, _ in verified.checks],
+        "warnings": ["A warning."],
+        "firmware": None,
+    }
+    assert given[-1][1] == {"accept_calibration": "it is so", "accept_firmware": False, "is_node": True}
+
+
+@pytest.mark.parametrize("option", [["--accept-firmware"], ["--accept-calibration", "it is so"]])
+def test_what_is_accepted_of_a_node_is_not_accepted_of_many_files(
+    home: Path, tmp_path: Path, option: list[str]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    for what in (["a.json", "b.json"], [tmp_path / "folder"]):
+        assert call(home, "--json", "verify", *what, *option).code == 2
