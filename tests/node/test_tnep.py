@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 
@@ -119,6 +120,82 @@ def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk)
     assert desk.tag.ready(5)
     records = message.decode(desk.mailbox.read())
     assert tnep.external(records, tnep.ID_TYPE) == desk.handler.identify()
+
+
+def shown_id(desk: Desk) -> bytes | None:
+    """Return the id record of the message in the mailbox, None if it has none."""
+    return tnep.external(message.decode(desk.mailbox.read()), tnep.ID_TYPE)
+
+
+def test_the_id_record_is_renewed_whenever_identify_changes_and_no_answer_gives_way_to_it(desk: Desk) -> None:
+    before = desk.handler.identify()
+    assert shown_id(desk) == before
+    desk.handler.frames.append(b"by another link")
+    desk.tag.idle()
+    settle(desk)
+    assert shown_id(desk) == desk.handler.identify() != before
+    desk.exchange(select())
+    (success,) = desk.exchange(select())
+    desk.handler.frames.append(b"by another link")
+    desk.tag.idle()
+    settle(desk)
+    assert message.decode(desk.mailbox.read()) == (success,), "the reader has not read its answer yet"
+
+
+def settle(desk: Desk) -> None:
+    """Wait until the worker has done what it was given."""
+    done = threading.Event()
+    desk.tag._jobs.put(done.set)
+    assert done.wait(60)
+
+
+@pytest.mark.parametrize("gone", [True, False], ids=["field lost", "activated anew"])
+def test_a_reader_selects_the_service_anew_after_each_activation(desk: Desk, gone: bool) -> None:
+    assert tnep.status_of(desk.exchange(select())) == tnep.SUCCESS
+    if gone:
+        desk.tag.lost()
+    desk.tag.activated()
+    assert desk.tag.ready(60)
+    assert tnep.status_of(desk.exchange(request(Piece(1, 4, 0, b"abcd")))) == tnep.PROTOCOL_ERROR
+    assert desk.handler.frames == []
+
+
+def test_half_a_request_goes_with_the_field(desk: Desk) -> None:
+    def held(piece: Piece) -> Piece:
+        payload = tnep.external(desk.exchange(request(piece)), tnep.TIM_TYPE)
+        assert payload is not None
+        return Piece.decode(payload)
+
+    desk.exchange(select())
+    assert held(Piece(5, 8, 0, b"abcd", more=True)) == Piece(5, 8, 4, b"", answer=True)
+    desk.tag.lost()
+    desk.tag.activated()
+    assert desk.tag.ready(60)
+    desk.exchange(select())
+    assert held(Piece(5, 8, 4, b"efgh")) == Piece(5, 8, 0, b"", answer=True)
+    assert desk.handler.frames == []
+
+
+def test_the_initial_message_octet_for_octet() -> None:
+    """Charge, Tp, id and the address in the air, in this order (wire.md, "NFC" and "BLE")."""
+    power = PowerReply(PowerFlag.BATTERY, 73)
+    air = bytes.fromhex("c0a1a2a3a4a5")
+    extras = charging.ExtraRecords(
+        before=lambda: charging.charge_records(power), after=lambda: (charging.out_of_band_record(air, random=True),)
+    )
+    memory = Type4Memory(500)
+    tag = TnepTag(memory, Handler(), wt_int=4, n_wait=15, extras=extras)
+    tag.start()
+    tag.stop()
+    service = b"urn:nfc:xsn:teds-provision:tim"
+    assert Mailbox(memory).read() == (
+        bytes.fromhex("910606") + b"WLCCAP" + bytes.fromhex("2001091e030a")
+        + bytes.fromhex("110702") + b"WLCSTAI" + bytes.fromhex("0149")
+        + bytes.fromhex("110225") + b"Tp" + b"\x10\x1e" + service + bytes.fromhex("00040f01f4")
+        + bytes.fromhex("141117") + b"teds-provision:id" + bytes(23)
+        + bytes.fromhex("52200c") + b"application/vnd.bluetooth.le.oob"
+        + bytes.fromhex("081ba5a4a3a2a1c00102" + "1c00")
+    )  # fmt: skip
 
 
 @given(st.lists(st.binary(min_size=1, max_size=80), max_size=8))

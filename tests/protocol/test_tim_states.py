@@ -346,6 +346,21 @@ def test_a_session_lives_ten_minutes_after_its_last_good_frame(seconds: float, l
     assert lives or reply.reason == Reason.WRONG_STATE
 
 
+def test_each_good_frame_gives_a_session_ten_minutes_more() -> None:
+    desk = Desk().agree().open()
+    for _ in range(4):
+        assert desk.sealed(COMMANDS["identify"]).ok
+        desk.now += 599
+    assert desk.sealed(COMMANDS["identify"]).ok
+    assert desk.session is not None
+    frame = desk.session.seal(COMMANDS["identify"]).payload
+    bad = security_command(Function.SEALED, frame[:-1] + bytes([frame[-1] ^ 1]))
+    desk.now += 599
+    desk.plain(bad)
+    desk.now += 1
+    assert desk.plain(COMMANDS["sealed"]) == refusal(Reason.WRONG_STATE), "a bad one gives it nothing"
+
+
 @pytest.mark.parametrize("end", ["close", "lost", "restart"])
 def test_what_ends_a_session(end: str) -> None:
     desk = Desk().agree().open()
