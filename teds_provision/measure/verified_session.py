@@ -86,6 +86,16 @@ LEASE_EACH = 0.2
 DEAD_MAN = 1000  # milliseconds without a set point after which an actuator is safe
 
 
+@dataclass
+class SessionLease:
+    """Seconds of the longest lease of this session's claims; 0 before the first.
+
+    The node has one for all of them, the last Operate's (operation.md section 1).
+    """
+
+    seconds: int = 0
+
+
 @dataclass(frozen=True)
 class VerifiedSession:
     """A node in a session, with a datasheet that was verified just now.
@@ -106,6 +116,7 @@ class VerifiedSession:
     profiles: Mapping[int, ChannelProfile] = field(default_factory=dict)
     frames: Mapping[int, str] = field(default_factory=dict)
     unverified: bool = False
+    lease: SessionLease = field(default_factory=SessionLease, compare=False)
 
     @property
     def uuid(self) -> str:
@@ -213,8 +224,13 @@ def ask_clock(node: Conversation) -> tuple[ClockReply, Exchange]:
 
 
 def claim(trusted: VerifiedSession, channel: int, *, lease: int, dead_man: int | None = None) -> None:
-    """Operate: claim a channel, 0 for every sensor; ``lease`` in s, ``dead_man`` in ms for an actuator."""
-    operate(trusted.node, channel, trusted.digest, lease=lease, dead_man=dead_man)
+    """Operate: claim a channel, 0 for every sensor; ``lease`` in s, ``dead_man`` in ms for an actuator.
+
+    It shortens no lease that the session has: an actuator of a measurement whose Clocks are rare would end its streams.
+    """
+    longest = max(lease, trusted.lease.seconds)
+    operate(trusted.node, channel, trusted.digest, lease=longest, dead_man=dead_man)
+    trusted.lease.seconds = longest
 
 
 def operation(node: Conversation) -> OperationReply:

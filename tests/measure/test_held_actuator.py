@@ -11,7 +11,7 @@ import pytest
 from teds_provision.errors import LinkError, NodeRefusedError
 from teds_provision.measure import held_actuator
 from teds_provision.measure.held_actuator import HeldActuator
-from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.measure.verified_session import VerifiedSession, claim
 from teds_provision.protocol.messages.frames import Command, Function
 from teds_provision.protocol.operation.commands import ChannelState, OperationReply
 from teds_provision.provisioning.conversation import SessionLostError
@@ -146,3 +146,24 @@ def test_a_quantity_means_its_set_point_unless_an_actuator_has_that_name() -> No
     assert meant(gripper, "valve") is None  # it is an actuator itself
     assert meant(gripper, "force") is None
     assert meant(gripper, 1) is None
+
+
+def test_the_claim_of_an_actuator_shortens_no_lease_of_its_session() -> None:
+    """A node has one lease for a session, the last Operate's: 40 s of many nodes on one bus would become 10."""
+    asked: list[tuple[int, bytes]] = []
+
+    class Claimed(Node):
+        def request(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
+            if (command.command_class, command.function) == (4, 1):
+                asked.append((command.channel, command.payload[16:]))
+            return super().request(command, doing, within=within)
+
+    node: Any = Claimed(ChannelState.SAFE, quiet, quiet)
+    session = VerifiedSession(node, SHEET, "00" * 32, "g")
+    with HeldActuator(session, 1, dead_man=400):
+        assert asked == [(1, bytes([10]) + (400).to_bytes(2, "big"))], "10 s where nothing longer was claimed"
+    asked.clear()
+    claim(session, 0, lease=40)
+    with HeldActuator(session, 1, dead_man=400):
+        pass
+    assert [(channel, payload[0]) for channel, payload in asked] == [(0, 40), (1, 40)]
