@@ -352,6 +352,7 @@ def test_a_sample_is_not_valid_while_a_sensor_says_so_or_tests_itself() -> None:
     bench.hardware.invalid = {2}
     assert bench.send(sample([1, 2])).payload[flags] == 1
     assert bench.send(sample([1])).payload[flags] == 0
+    assert bench.send(sample([2, 1])).payload[flags] == 1, "whichever of them it is"
     bench.hardware.tests = {1}
     assert bench.send(sample([1])).payload[flags] == 1
     assert bench.operation().channels[1][0] & ChannelState.TESTING

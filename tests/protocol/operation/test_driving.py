@@ -6,8 +6,9 @@ import pytest
 
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.operation.commands import ChannelState
-from teds_provision.protocol.operation.datagram import Layout
+from teds_provision.protocol.operation.datagram import DatagramSealer, DriveValues, Layout, drive_key
 from teds_provision.protocol.operation.driving import Driver
+from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
     NONE,
@@ -202,3 +203,21 @@ def test_messages_without_a_session_or_a_drive_are_nothing() -> None:
     bench.tim.event(5, 1, b"\0")
     assert bench.send(security_command(Function.CLOSE)).ok
     assert bench.tim.next_frame("can") is None
+
+
+def test_over_ble_a_message_comes_whole_and_in_no_other_length() -> None:
+    bench = Bench().open("ble:2", SessionPort("ble", "ble", 2, mtu=247))
+    bench.tim.drive("ble:2", bytes(20))
+    bench.operate(4, 6, link="ble:2", dead_man=500)
+    bench.tim.drive("ble:2", bytes(20))
+    reply = DriveReply.decode(bench.send(drive([4, 6]), "ble:2").payload)
+    assert reply == DriveReply(1, 20), "counter 4, until 4, data sets 2 and 2, tag 8"
+    sealer = DatagramSealer(drive_key(bench.sessions["ble:2"].message_key, 1))
+    until = (bench.hardware.tick + 100 * MS) // 1000
+    octets = bytes.fromhex("03e803e9")
+    for counter, data in ((0, octets + b"\0"), (1, octets[:3])):
+        bench.tim.drive("ble:2", sealer.seal(counter, DriveValues(until, data).encode()))
+        assert clock(bench, "ble:2").last == NONE, "dropped before its tag is looked at"
+    bench.tim.drive("ble:2", sealer.seal(0, DriveValues(until, octets).encode()))
+    assert (bench.hardware.points[4], bench.hardware.points[6]) == (b"\x03\xe8", b"\x03\xe9")
+    assert clock(bench, "ble:2").last == 0

@@ -16,7 +16,7 @@ from teds_provision.protocol.operation.commands import (
     set_values,
     write_data_set,
 )
-from teds_provision.protocol.operation.hardware import SessionPort
+from teds_provision.protocol.operation.hardware import ChannelHardware, SessionPort
 from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
     WAITS,
@@ -27,6 +27,7 @@ from teds_provision.protocol.operation.stream_commands import (
     drive,
     stop,
 )
+from teds_provision.teds.sheet import ChannelKind
 
 from .bench import DIGEST, MS, SECOND, Bench, channel_teds, channels
 
@@ -182,16 +183,17 @@ def test_data_sets_in_the_order_of_section_2() -> None:
     assert not [entry for entry in bench.hardware.log if entry[0] == "apply"], "nothing was applied"
 
 
-def test_a_sample_that_no_message_holds_gets_10() -> None:
+@pytest.mark.parametrize(("last", "reason"), [(204, None), (205, Reason.TOO_LARGE)])
+def test_a_sample_that_no_message_holds_gets_10(last: int, reason: Reason | None) -> None:
+    """9 + Σ ModLenth is at most maxMessage - 46: 978 of 1024."""
+    widths = {1: 255, 2: 255, 3: 255, 6: last}
     bench = Bench(max_message=1024)
-    wide = {number: type(facts)(facts.kind, 255) for number, facts in channels().items() if not facts.actuator}
-    bench.hardware.channels = wide
-    blocks = dict(bench.memory.state.blocks) | {(number, 3): channel_teds(facts) for number, facts in wide.items()}
-    object.__setattr__(bench.memory.state, "blocks", blocks)
+    bench.hardware.channels = {number: ChannelHardware(ChannelKind.SENSOR, width) for number, width in widths.items()}
+    blocks = {(number, 3): channel_teds(facts) for number, facts in bench.hardware.channels.items()}
+    object.__setattr__(bench.memory.state, "blocks", {**bench.memory.state.blocks, **blocks})
     bench.restart()
     bench.open().operate(0)
-    assert bench.send(sample([1, 2, 3])).ok, "9 + 765 octets fit 978"
-    assert bench.reason(sample([1, 2, 3, 5])) == Reason.TOO_LARGE
+    assert bench.reason(sample([1, 2, 3, 6])) == reason
 
 
 def test_self_test_power_operation_clock_and_idle() -> None:
@@ -399,3 +401,25 @@ def test_outside_a_session_they_get_3() -> None:
         found = {number: bench.plain(R(0, *number, b"\1"), link).reason for number in numbers}
         assert found == dict.fromkeys(numbers, Reason.NOT_PERMITTED)
     assert bench.plain(R(0, 128, 21)).reason == Reason.UNKNOWN_COMMAND
+
+
+def test_a_gap_of_0_counts_as_one_microsecond() -> None:
+    """15 octets are 2 frames: each takes 2 · 1 µs of n · period."""
+    bench = Bench().open().operate(1)
+    sent(
+        bench,
+        [
+            ("2 µs of every 1.999", subscribe(n=1, period=1999), U.DOES_NOT_FIT),
+            ("2 µs of every 2", subscribe(n=1, period=2000), None),
+            ("gap 1", subscribe(n=1, period=2000, gap=1), None),
+            ("gap 2", subscribe(n=1, period=2000, gap=2), U.DOES_NOT_FIT),
+        ],
+    )
+
+
+def test_a_share_of_the_budget_is_rounded_up() -> None:
+    """⌈2 · 2 · 10^9 / 4000001⌉ + ⌈2 · 2 · 10^9 / 4 · 10^9⌉ … each part counts whole."""
+    bench = Bench().open().operate(1)
+    assert bench.reason(subscribe(n=1, gap=2, period=4001)) is None, "⌈999750.06⌉ = 999751 ppm"
+    assert bench.reason(subscribe(stream=1, n=1, period=16_064_258)) is None, "⌈248.9⌉ = 249: 10^6 are full"
+    assert bench.reason(subscribe(stream=1, n=1, period=16_064_256)) == Reason.DOES_NOT_FIT, "⌈249.0000…⌉ = 250"

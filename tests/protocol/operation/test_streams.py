@@ -203,6 +203,21 @@ def test_ble_streams_are_whole_notifications_of_their_connection() -> None:
     assert values(message) == [100, 110]
 
 
+def test_notifications_that_are_disabled_end_the_streams_of_their_connection_alone() -> None:
+    bench = Bench()
+    links = ("ble:2", "ble:3")
+    for link in links:
+        bench.open(link, SessionPort("ble", "ble", int(link[-1]), mtu=247)).operate(1, link=link)
+        assert bench.send(StreamPlan.for_channels(0, ((1, 2),), n=1, period=50 * MS).command(), link).ok
+    bench.later(100 * MS)
+    assert {frame.link_source for _, frame in bench.frames} == {2, 3}
+    bench.tim.unheard("ble:2")
+    bench.frames.clear()
+    bench.later(100 * MS)
+    assert {frame.link_source for _, frame in bench.frames} == {3}
+    assert [bench.reason(stop(0), link) for link in links] == [Reason.WRONG_STATE, None]
+
+
 # -- events, free, test pattern ----------------------------------------------------------------------------------------
 
 
@@ -249,3 +264,33 @@ def test_flags_speak_of_their_message_alone() -> None:
     bench.hardware.faults = {1}
     bench.until(165 * MS)
     assert [m.valid for m in consumer.messages()] == [False], "a fault, told by the hardware apart"
+
+
+# -- which stream, which session ---------------------------------------------------------------------------------------
+
+
+def test_a_stream_ends_with_a_claim_of_its_own_channels_in_its_own_session_alone() -> None:
+    bench = Bench().open().open("can:f2").operate(1, 2, 3).operate(1, link="can:f2")
+    one, both = Consumer(bench, 0, (1,), start=100 * MS), Consumer(bench, 1, (2, 3), start=100 * MS)
+    other = Consumer(bench, 0, (1,), start=100 * MS, link="can:f2")
+
+    def came(until: int) -> list[bool]:
+        bench.until(until)
+        return [bool(consumer.messages()) for consumer in (one, both, other)]
+
+    assert came(150 * MS) == [True, True, True]
+    bench.idle(3)
+    assert came(200 * MS) == [True, False, True], "one channel of two is enough; the other stream goes on"
+    bench.idle(1, "can:f2")
+    assert came(250 * MS) == [True, False, False], "the other session's claim of the same sensor"
+    assert bench.reason(stop(1)) == Reason.WRONG_STATE
+    assert bench.send(stop(0)).ok
+
+
+def test_the_node_wants_to_be_called_for_the_first_instant_of_all_its_streams() -> None:
+    bench = Bench().open().operate(1, 2)
+    Consumer(bench, 0, (1,), start=200 * MS)
+    Consumer(bench, 1, (2,), start=120 * MS)
+    wait = bench.tim.poll()
+    assert wait is not None
+    assert round(wait * SECOND) == 120 * MS - bench.hardware.tick

@@ -87,3 +87,23 @@ def test_a_stop_trigger_brings_every_actuator_of_the_session_to_its_safe_state()
     assert bench.hardware.points[4] == SAFE_VALUE
     assert states[6] == (ChannelState.ACTUATOR | ChannelState.CLAIMED_BY_OTHER, 0xF2), "the other session's goes on"
     assert states[1][0] == ChannelState.CLAIMED_HERE, "and its own sensors"
+
+
+def test_a_trigger_that_marks_or_starts_moves_no_actuator() -> None:
+    bench = Bench().open().operate(1, 4)
+    bench.send(write_data_set(4, b"\x03\xe8"))
+    for action in (Action.MARK, Action.START):
+        token = armed(bench, action)
+        bench.tim.trigger("can:f1", token.octets, 7)
+        assert clock(bench).mark == 7
+        assert bench.operation().channels[4] == (ChannelState.ACTUATOR | ChannelState.CLAIMED_HERE, 0xF1)
+        assert int.from_bytes(bench.hardware.points[4], "big") == 1000
+
+
+def test_arm_needs_no_claim_and_a_new_one_replaces_that_of_its_action_alone() -> None:
+    bench = Bench().open()
+    stop, mark = armed(bench, Action.STOP), armed(bench, Action.MARK)
+    again = armed(bench, Action.STOP)
+    for token, seen in ((stop, 0), (mark, 2), (again, 3)):
+        bench.tim.trigger("can:f1", token.octets, {0: 1}.get(seen, seen))
+        assert clock(bench).mark == seen
