@@ -1,0 +1,85 @@
+"""The numbers of docs/contract/cli.md and docs/contract/api.md, as literals."""
+
+from __future__ import annotations
+
+from teds_provision import client, firmware_image
+from teds_provision.api import bodies, operations
+from teds_provision.cli.measure.record import SHOWN
+from teds_provision.links import ports
+from teds_provision.links.can import spec, transfer_pace
+from teds_provision.measure import background_reread, sample_series, standing, verified_session, zero
+from teds_provision.measure import sampling as one_sample
+from teds_provision.measure.held_actuator import LONGEST_PAUSE
+from teds_provision.measure.sinks import base, foxglove_server
+from teds_provision.ncap import history, live, membership, waits
+from teds_provision.ncap.nodes import actuator_leases, simulation
+from teds_provision.ncap.web import app, guard, tokens
+from teds_provision.node.wrapped import description
+from teds_provision.protocol import announce, fingerprints
+from teds_provision.protocol.messages import firmware
+from teds_provision.protocol.operation import budget
+from teds_provision.provisioning import batch_sheet, image_manager, update
+from teds_provision.station import groups, label
+from teds_provision.station import nodes as known_nodes
+from teds_provision.teds import channel
+from teds_provision.vault import agent
+
+
+def test_the_numbers_of_the_contract() -> None:
+    """Other tests reach these limits by the names of the constants: here they are what the contract says."""
+    numbers: dict[str, tuple[object, object]] = {
+        "a UUID is known by four digits": (known_nodes._MIN_PREFIX, 4),
+        "a fingerprint has 64 digits, 32 of them count": ((fingerprints.DIGITS, fingerprints.LEAST_DIGITS), (64, 32)),
+        "a label begins with TEDS1": (label.PREFIX, "TEDS1"),
+        "no group is called all": ((groups.ALL, groups.LONGEST), ("all", 64)),
+        "identify listens for three seconds at least": (ports.LISTEN_SECONDS, 3.0),
+        "bit rates that are assumed": ((spec.DEFAULT_BITRATE, spec.DEFAULT_DATA_BITRATE), (500_000, 2_000_000)),
+        "addresses of stations and nodes": (
+            (spec.FIRST_STATION, spec.LAST_STATION, spec.LAST_NODE, announce.LAST_ADDRESS), (0xF1, 0xF7, 0xEF, 239)
+        ),
+        "identifier of Announce": (announce.ANNOUNCE, 0x1CFF0000),
+        "a board blinks for a minute at most": (firmware.LOCATE_SECONDS, 60),
+        "an image names its board": (firmware_image.BOARD_TLV, 0x54A0),
+        "a restarted board has 180 s": (update.WAIT_SECONDS, 180.0),
+        "three offsets that do not grow": (image_manager._STUCK, 3),
+        "packets leave a tenth of a bus": (transfer_pace._MOST, 0.9),
+        "results of an update": (update.RESULTS, ("updated", "already", "reverted", "refused", "lost")),
+        "leases grow with the bus": (
+            (verified_session.LEASE, verified_session.LEASE_EACH, verified_session.LONGEST_LEASE), (10, 0.2, 60)
+        ),
+        "an actuator is fed every half second at least": (LONGEST_PAUSE, 0.5),
+        "a set point has a dead-man of a second": (verified_session.DEAD_MAN, 1000),
+        "a zero is the mean of 16 samples at least": ((sample_series.SAMPLES, zero._AFTERWARDS), (32, 16)),
+        "one reading claims for seconds": (one_sample.LEASE, 5),
+        "what a full turn is": ((channel._NEARLY_A_TURN, channel.TURN), (1e-5, 6.283185307179586)),
+        "data take a part of the bus": (budget.MOST_LOAD, 0.6),
+        "today's verdict within two seconds": (
+            (standing.SETTLING, waits.USUAL.selection, waits.USUAL.store, waits.USUAL.token), (0.5, 2.0, 1.0, 1.0)
+        ),
+        "the rest is read in what data leave free": ((background_reread.GAP, background_reread.SPARING), (1, 4.0)),
+        "a command waits five seconds for a node": (client.LETTING_GO, 5.0),
+        "why a newcomer waits": ((membership.NO_ROOM, membership.AGAIN), ("no room on the bus", 30.0)),
+        "a sheet": ((batch_sheet.MAX_ROWS, batch_sheet._LEAST_DIGITS), (10_000, 32)),
+        "columns of a sheet": (
+            batch_sheet.COLUMNS, ("uuid", "name", "profile", "calibration", "item", "fingerprint")
+        ),
+        "a wrapped value is too old after three periods": (description.PERIODS_LATE, 3),
+        "a vault is held open for twelve hours at most": (agent.MOST_SECONDS, 43_200),
+        "values that record show gives": (SHOWN, 20),
+        "Foxglove on this machine": (foxglove_server.USUAL, "127.0.0.1:8765"),
+        "rows and messages to topics": ((base.ROWS, base.BUDGET), (1000, 5000)),
+        # docs/contract/api.md
+        "a body": ((guard.LARGEST_BODY, operations.LARGEST_IMAGE), (1_048_576, 4_194_304)),
+        "ten wrong tokens in a minute": ((guard._WRONG_TOKENS, guard._WRONG_WITHIN), (10, 60.0)),
+        "a login and a browser": ((tokens.LOGIN_SECONDS, tokens.BROWSER_SECONDS), (300.0, 2_592_000.0)),
+        "what one answer holds": (
+            (operations.MOST_NODES, operations.MOST_ENTRIES, operations.MOST_POINTS), (1000, 10_000, 3600)
+        ),
+        "an update": ((operations.MOST_AT_ONCE, operations.LONGEST_WAIT), (24, 3600)),
+        "a set point is held": ((actuator_leases.HOLD, bodies.LONGEST_HOLD), (1.0, 60.0)),
+        "points a second of a live channel": (live.POINTS, 100.0),
+        "the past": ((history.HOUR, history.MINUTE, history.FINE), (3600, 60, 0.01)),
+        "a simulation feeds 1 MiB/s": (simulation.MOST_OCTETS, 1_048_576),
+        "places of /live": ((app.MOST_LISTENERS, app.OF_ONE_TOKEN), (200, 100)),
+    }  # fmt: skip
+    assert {what: one for what, (one, _) in numbers.items()} == {what: due for what, (_, due) in numbers.items()}
