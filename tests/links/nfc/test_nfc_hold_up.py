@@ -9,8 +9,8 @@ import pytest
 from teds_provision.errors import GarbledError, NodeSilentError
 from teds_provision.links.nfc import message, tag, tnep
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
-from teds_provision.links.nfc.pieces import LONGEST_FRAME, Piece, Requester
-from teds_provision.links.nfc.poller import LONGEST, Poller
+from teds_provision.links.nfc.pieces import Piece, Requester
+from teds_provision.links.nfc.poller import Poller
 
 SERVICE = tnep.ServiceParameters(tnep.SERVICE, 20, 15, 499)
 
@@ -35,8 +35,8 @@ class EndlessReply:
             return
         asked = Piece.decode(payload)
         offset = 0 if asked.body else asked.offset
-        body = bytes(min(self.step, LONGEST_FRAME - offset))
-        piece = Piece(asked.transaction, LONGEST_FRAME, offset, body, answer=True, more=True)
+        body = bytes(min(self.step, 4094 - offset))
+        piece = Piece(asked.transaction, 4094, offset, body, answer=True, more=True)
         self._answer = message.encode([status, tnep.payload_record(piece.encode())])
 
     def read(self) -> bytes:
@@ -47,20 +47,20 @@ def test_a_reply_in_drops_ends_after_two_minutes() -> None:
     node = EndlessReply(8, 4.0)
     with pytest.raises(NodeSilentError, match="120 s"):
         Poller(node, SERVICE, clock=lambda: node.now, sleep=node.sleep).transact(1, bytes(10))
-    assert node.now < LONGEST + 15
+    assert node.now < 135
 
 
 def test_a_slow_node_has_the_time_that_it_needs() -> None:
     node = EndlessReply(100, 2.0)
     reply = Poller(node, SERVICE, clock=lambda: node.now, sleep=node.sleep).transact(1, bytes(10))
-    assert len(reply) == LONGEST_FRAME
+    assert len(reply) == 4094
 
 
 def test_no_reply_is_longer_than_the_longest_frame() -> None:
     requester = Requester(1, bytes(10), 100)
     with pytest.raises(GarbledError, match="at most 4094 are allowed"):
-        requester.handle_piece(Piece(1, LONGEST_FRAME + 1, 0, bytes(8), answer=True))
-    assert requester.handle_piece(Piece(1, LONGEST_FRAME, 0, bytes(8), answer=True))
+        requester.handle_piece(Piece(1, 4094 + 1, 0, bytes(8), answer=True))
+    assert requester.handle_piece(Piece(1, 4094, 0, bytes(8), answer=True))
 
 
 class StuckFrontEnd:
