@@ -11,8 +11,10 @@ from collections.abc import Iterator
 import pytest
 
 from teds_provision.links.can.isotp import single
+from tests.firmware.bench import CBench
 from tests.firmware.memory_node import MemoryNode
 from tests.protocol.desk import NODE, UUID
+from tests.protocol.operation.bench import SECOND
 
 pytestmark = pytest.mark.system
 
@@ -168,3 +170,21 @@ def test_at_most_twenty_announces_a_minute(bus: Bus) -> None:
     times = [at for at, _ in left]
     assert all(sum(start <= at < start + 60 for at in times) <= 20 for start in times)
     assert len(times) >= 59, "and no fewer"
+
+
+@pytest.mark.parametrize("waits", [False, True], ids=["at once", "when the move is due"])
+def test_who_has_an_actuator_claimed_stays_and_goes_on_announcing(waits: bool) -> None:
+    bench = CBench()
+    claims_it = b"\1" + bytes(7)  # the smallest CRC that there is
+    for _ in range(4 if waits else 0):  # three moves at once, and the fourth waits a second
+        bench.tim.take_frame(0x1CFF0000 | bench.tim.can_address, claims_it)  # type: ignore[attr-defined]
+    address = bench.tim.can_address
+    bench.open().operate(4)
+    if not waits:
+        bench.tim.take_frame(0x1CFF0000 | address, claims_it)  # type: ignore[attr-defined]
+    bench.frames.clear()
+    bench.later(3 * SECOND)
+    assert bench.tim.can_address == address
+    assert 0x1CFF0000 | address in {frame.identifier for _, frame in bench.frames}
+    assert bench.tim.actuator_claimed(), "its session goes on"
+    CBench.close_all()
