@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any, cast
 import click
 import pytest
 
+import teds_provision
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import LineReporter, LiveReporter, reporter_for
 from teds_provision.cli.terminal_operator import TerminalOperator
@@ -20,6 +23,11 @@ from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.provisioning.batch_sheet import DeclinedError
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.station.station import Station
+from tests.bench import PASSPHRASE
+from tests.parsed import parsed
+
+from .shell import call
 
 UUID, KEY = "8d4d9da65281f7000000", "0123456789abcdef" * 4
 OTHER = KEY[:20] + "f" + KEY[21:]
@@ -251,3 +259,53 @@ def test_a_yes_to_the_differences_retypes_one_board_and_nothing_else_does(
     with pytest.raises(PolicyError, match="keeps its type"):
         operator.retype(WHO.uuid, tuple(differences))
     assert len(asked) == 2
+
+
+# -- locks -------------------------------------------------------------------------------------------------------------
+
+ASKS = frozenset(["confirm", "ask_yes_no", "ask_text", "ask_for_key", "ask_secret", "ask_new", "unlock", "_reset"])
+
+
+def test_no_command_holds_the_store_while_it_asks() -> None:
+    """A person may take an hour; read from the sources, as no test reaches every question."""
+    found = []
+    package = Path(teds_provision.__file__).parent
+    for file in (*package.glob("cli/**/*.py"), *package.glob("*/commands.py"), *package.glob("*/commands/*.py")):
+        for block in ast.walk(parsed(file)):
+            if not isinstance(block, ast.With):
+                continue
+            held = [ast.unparse(item.context_expr) for item in block.items]
+            if not any(re.search(r"\.(lock|durable|transaction)\(", text) for text in held):
+                continue
+            calls = [call.func for call in ast.walk(block) if isinstance(call, ast.Call)]
+            names = [getattr(func, "attr", getattr(func, "id", "")) for func in calls]
+            found += [f"{file.name}:{block.lineno} {name}" for name in names if name in ASKS]
+    assert found == []
+
+
+def test_a_spare_takes_over_what_the_person_was_asked_about_or_nothing(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spare = "8d4d9da65281f70000ff"
+    call(home, "whitelist", "add", UUID, "--name", "elbow")
+    call(home, "whitelist", "add", spare)
+    with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as station, station.transaction():
+        station.nodes.remember(bytes.fromhex(UUID), name="elbow")
+        station.nodes.remember(bytes.fromhex(spare))
+
+    def renamed_meanwhile(_app: App, _question: str, *, yes: bool) -> None:
+        assert yes
+        with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as other, other.durable("names set"):
+            other.nodes.remember(bytes.fromhex(UUID), name="knee")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(App, "confirm", renamed_meanwhile)
+        refused = call(home, "--json", "replace", UUID, spare, "--yes")
+    assert (refused.code, refused.json["error"]["message"]) == (
+        6,
+        "Another command changed the plan while this one was waiting.",
+    )
+    found = {node["uuid"]: (node["name"], node["retired"]) for node in call(home, "--json", "nodes").json["nodes"]}
+    assert found == {UUID: ("knee", None), spare: (None, None)}
+    done = call(home, "--json", "replace", UUID, spare, "--yes")
+    assert (done.code, done.json["name"], done.json["fresh"]) == (0, "knee", True)

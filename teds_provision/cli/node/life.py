@@ -11,6 +11,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
+from teds_provision.cli.station.handover import require_same
 from teds_provision.errors import FrozenError, LinkError, PolicyError
 from teds_provision.handover import deny, life
 from teds_provision.handover.life import TakeoverPlan, hand_on, is_finished, plan_takeover, retire, take_over
@@ -109,8 +110,8 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     app.confirm(
         f"Take node {octets.hex()} out of service? Its key will be erased on the node and on this station.", yes=yes
     )
+    receipt = _reset(app, station, octets, links, force=force)  # without the lock: it may ask, and wait for the node
     with station.lock("decommission", app.note):
-        receipt = _reset(app, station, octets, links, force=force)
         left = retire(station, octets, receipt)
     state = "is out of service and signed that it is in factory state" if receipt else "is out of service, unconfirmed"
     result = _result(octets, receipt) | {"fresh": True, "removed": left.to_json()}
@@ -194,22 +195,29 @@ def replace(
     station = app.station()
     octets, spare = station.nodes.resolve(old), station.nodes.resolve(new)
     station.unlock(octets)
+    shown = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
+    result, text = _takeover(shown)
+    result["groups"] = station.groups.names_of_node(spare if shown.done else octets)
+    if dry_run:
+        app.emit({**result, "plan": True}, f"Plan: {text}.")
+        return
+    receipt = None
+    if not shown.done:
+        app.confirm(f"{text}?", yes=yes)
+        # without the lock: it may wait for the node
+        receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
     with station.lock("replace", app.note):
         plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
-        result, text = _takeover(plan)
-        result["groups"] = station.groups.names_of_node(spare if plan.done else octets)
-        if dry_run:
-            app.emit({**result, "plan": True}, f"Plan: {text}.")
-            return
+        require_same(_takeover(plan)[0] == _takeover(shown)[0] and plan.done == shown.done)
         if plan.done:
             moved = hand_on(station, plan)
-            rest = _handed_on(moved, "Moved")
-            text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
-            app.emit({**result, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
-            return
-        app.confirm(f"{text}?", yes=yes)
-        receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
-        warnings, moved = take_over(station, plan, receipt)
+        else:
+            warnings, moved = take_over(station, plan, receipt)
+    if plan.done:
+        rest = _handed_on(moved, "Moved")
+        text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
+        app.emit({**result, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
+        return
     for warning in warnings:
         app.warn(warning)
     confirmed = receipt is not None
