@@ -392,8 +392,17 @@ class MemoryNode:
 
     def ble_written(self, connection: int, value: bytes) -> list[bytes]:
         """A station writes a piece of a command; the notifications that follow."""
+        self.ble_write(connection, value)
+        return self.ble_notified(connection)
+
+    def ble_write(self, connection: int, value: bytes) -> None:
+        """A station writes a piece of a command, and the chip takes no notification yet."""
         self._now()
         self._library.memory_ble_written(self._board, ctypes.c_uint8(connection), value, ctypes.c_size_t(len(value)))
+
+    def ble_notified(self, connection: int) -> list[bytes]:
+        """Return the notifications that the chip takes now."""
+        self._now()
         out, notified = ctypes.create_string_buffer(512), []
         while length := self._library.memory_ble_notify(self._board, ctypes.c_uint8(connection), out):
             notified.append(out.raw[:length])

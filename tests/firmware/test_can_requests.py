@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from teds_provision.links.can.isotp import single
+from teds_provision.links.can.isotp import consecutive_frames, first_frame, single
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.messages.frames import IDENTIFY
+from teds_provision.protocol.session import StationSession
 from tests.firmware.desk import CDesk
 from tests.firmware.memory_node import MemoryNode
 from tests.protocol.desk import NODE, UUID
@@ -99,3 +100,30 @@ def test_a_long_request_of_a_stranger_gives_way_to_one_of_a_session_and_to_no_ot
     assert frames.keys() == {0xF2, 0xF3}
     assert frames[0xF2].startswith(FLOW_CONTROL)
     assert frames[0xF3].startswith(REFUSED_17)
+
+
+def test_a_long_reply_is_kept_for_20_seconds_from_its_last_frame(desk: CDesk) -> None:
+    session = StationSession(desk.key, UUID)
+    opening = session.open(desk.plain(session.request_counter(), link="can:f3", tapped=False).payload)
+    to_node = 0x18DA00F3 | OWN << 8
+
+    def asks() -> str:
+        """Send the Open in FD frames; return the first frame of what comes back."""
+        head, rest = first_frame(b"\x07" + opening.encode(), fd=True)
+        desk.node.take_frame(to_node, head, fd=True)
+        assert sent_to(desk.node, 0xF3).startswith(FLOW_CONTROL)
+        for frame in consecutive_frames(rest, fd=True):
+            desk.node.take_frame(to_node, frame, fd=True)
+        return sent_to(desk.node, 0xF3)
+
+    reply = asks()
+    assert reply.startswith("105507010051")
+    desk.now += 0.9
+    desk.node.take_frame(to_node, bytes.fromhex("300000"), fd=True)
+    assert sent_to(desk.node, 0xF3).startswith("21")
+    desk.now += 19.9
+    assert asks() == reply
+    desk.node.take_frame(to_node, bytes.fromhex("300000"), fd=True)
+    assert sent_to(desk.node, 0xF3).startswith("21")
+    desk.now += 20.0
+    assert asks().startswith("05070000010c"), "run again, it is no longer good"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -289,6 +290,55 @@ def test_a_selection_that_does_not_add_up(taps: Callable[[int, int], Taps], sele
     reader.write(message.encode([NdefRecord(WELL_KNOWN, b"WLCINF", b"")]))
     reader.write(message.encode([piece, piece]))
     reader.write(message.encode([piece]))
+
+
+def payload(head: str, body: bytes) -> bytes:
+    """Return a payload record with a right CRC: version, flags, transaction, total, offset, and the body."""
+    octets = bytes.fromhex(head)
+    return octets + zlib.crc32(octets + body).to_bytes(4, "big") + body
+
+
+def test_what_a_payload_record_may_not_be(taps: Callable[[int, int], Taps]) -> None:
+    """Its version is 1, its parts lie within the whole, it is no answer: else Te 80; nothing of it is kept."""
+    reader = taps(3, 499)
+    select = message.encode([tnep.select(tnep.SERVICE)])
+    held_nothing = payload("01 01 0009 0006 0000", b"")
+
+    def answer(octets: bytes) -> bytes:
+        return reader.write(message.encode([tnep.payload_record(octets)]))
+
+    assert reader.write(select) == bytes.fromhex("d10201546500")
+    for wrong in (
+        payload("00 00 0009 0006 0000", IDENTIFY),
+        payload("02 00 0009 0006 0000", IDENTIFY),
+        payload("01 01 0009 0006 0000", IDENTIFY),
+        payload("01 00 0009 0005 0000", IDENTIFY),
+        payload("01 00 0009 0006 0001", IDENTIFY),
+        payload("01 00 0009 0006 0000", IDENTIFY)[:-1] + b"\1",
+        payload("01 00 0009 0006 0000", b"")[:11],
+    ):
+        assert answer(wrong) == bytes.fromhex("d10201546580"), wrong.hex()
+    assert answer(payload("01 00 0009 0006 0000", b"")).endswith(held_nothing)
+    assert answer(payload("01 02 0009 0006 0000", IDENTIFY[:4])).endswith(payload("01 01 0009 0006 0004", b""))
+    assert answer(payload("01 02 0009 0007 0004", IDENTIFY[4:])).endswith(payload("01 01 0009 0007 0000", b""))
+    reply = answer(payload("01 00 0009 0006 0000", IDENTIFY))
+    assert payload("01 01 0009 001a 0000", b"\1\0\x17" + reply[-23:]) == reply[-38:]
+
+
+def test_half_a_request_and_a_reply_go_with_the_field(taps: Callable[[int, int], Taps]) -> None:
+    reader = taps(4, 499)
+    select = message.encode([tnep.select(tnep.SERVICE)])
+    more = message.encode([tnep.payload_record(payload("01 00 0009 0006 0000", b""))])
+    for piece, held in ((IDENTIFY[:4], "0004"), (IDENTIFY, "")):
+        reader.write(select)
+        reader.write(message.encode([tnep.payload_record(payload("01 00 0009 0006 0000", piece))]))
+        answer = reader.write(more)
+        assert answer.endswith(payload(f"01 01 0009 0006 {held}", b"")) if held else len(answer) > 60
+        reader.activate()
+        assert reader.write(more) == bytes.fromhex("d10201546501"), "nor is the service selected any more"
+        reader.write(select)
+        assert reader.write(more).endswith(payload("01 01 0009 0006 0000", b""))
+        reader.activate()
 
 
 @pytest.mark.parametrize("fsdi", [0, 2, 8])

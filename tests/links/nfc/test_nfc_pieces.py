@@ -103,6 +103,13 @@ def test_a_payload_record_has_the_layout_of_the_profile() -> None:
     assert Piece(0, 9, 0, b"", more=True).encode()[1] == 2
 
 
+@pytest.mark.parametrize("version", [0, 2, 255])
+def test_a_payload_record_of_another_version_is_garbled_though_its_crc_is_right(version: int) -> None:
+    head = bytes([version]) + bytes.fromhex("00000700040000")
+    with pytest.raises(GarbledError, match=f"of version {version}"):
+        Piece.decode(head + zlib.crc32(head + b"abcd").to_bytes(4, "big") + b"abcd")
+
+
 @given(
     st.builds(
         Piece, U16, st.just(0xFFFF), st.integers(0, 0x8000), st.binary(max_size=600), st.booleans(), st.booleans()
