@@ -101,6 +101,11 @@ class MeasuringLink(Port, ABC):
     def airtime(self, node: int | None = None) -> Airtime:
         """Return what messages of this node take of the link; None: of any node, at worst."""
 
+    @property
+    def others_load(self) -> float:
+        """Share of this link that data for other stations takes now."""
+        return 0.0
+
     # -- actuators -------------------------------------------------------------------------------------------------
 
     @abstractmethod

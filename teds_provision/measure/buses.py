@@ -24,7 +24,7 @@ class MeasuredBus:
     def __init__(self, port: MeasuringLink, sightings: SightingSink, *, poll: float | None) -> None:
         self.port = port
         self.hearing = HearingThread(port)
-        self.share = BusShare(BusTime(port.airtime()))
+        self.share = BusShare(BusTime(port.airtime()), others=lambda: port.others_load)
         self.discovery = port.discover(sightings, poll=poll)
         self.reading = threading.Lock()
         """Held while a datasheet is read in the background of a measurement: one node at a time."""

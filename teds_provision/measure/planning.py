@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from teds_provision.errors import BadDataError, NoRoomError, PolicyError
@@ -39,6 +39,7 @@ class BusTime:
 class BusShare:
     """Share of a bus that this station's streams use; nodes request their share one after another.
 
+    ``others`` gives the share that the data of other stations takes: it counts as taken (operation.md section 4).
     ``expected`` are the nodes of the measurement. The share of those that do not stream yet (``wanted``; a full part if
     it is not known) is reserved, so that the first node does not take the room of the second.
     """
@@ -48,12 +49,13 @@ class BusShare:
     taken: dict[bytes, float] = field(default_factory=dict)
     wanted: dict[bytes, float] = field(default_factory=dict)
     lock: threading.Condition = field(default_factory=threading.Condition)
+    others: Callable[[], float] = lambda: 0.0
 
     def for_node(self, uuid: bytes, *, sharing: bool = False) -> BusTime:
         """Return the bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
-        used = sum(load for key, load in self.taken.items() if key != uuid)
+        used = self._taken_by_others() + sum(load for key, load in self.taken.items() if key != uuid)
         if sharing:
-            used += self._kept_for_others(uuid, MOST_LOAD - used)
+            used += self._kept_for_others(uuid, max(0.0, MOST_LOAD - used))
         return replace(self.time, taken=used)
 
     def announce_share(self, uuid: bytes, load: float) -> None:
@@ -75,7 +77,7 @@ class BusShare:
     def room(self) -> float:
         """Share of the bus that is free for data now."""
         with self.lock:
-            return max(0.0, MOST_LOAD - self.time.taken - sum(self.taken.values()))
+            return max(0.0, MOST_LOAD - self._taken_by_others() - sum(self.taken.values()))
 
     @property
     def nodes(self) -> int:
@@ -95,6 +97,9 @@ class BusShare:
         with self.lock:
             self.taken.pop(uuid, None)
         self.drop_node(uuid)
+
+    def _taken_by_others(self) -> float:
+        return self.time.taken + self.others()
 
     def _kept_for_others(self, uuid: bytes, room: float) -> float:
         """Return the part of ``room`` reserved for others.

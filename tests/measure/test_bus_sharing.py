@@ -93,12 +93,12 @@ def test_room_and_nodes_of_a_bus_count_who_is_expected_and_what_others_take() ->
     assert (share.nodes, share.room) == (1, pytest.approx(0.5))
     share.taken |= {FIRST: 0.2, SECOND: 0.1}
     assert (share.nodes, share.room) == (2, pytest.approx(0.2))
-    assert share.for_node(FIRST).taken == pytest.approx(0.1), "its own part is free for itself"
+    assert share.for_node(FIRST).taken == pytest.approx(0.2), "its own part is free for itself"
     share.expect([THIRD], 0.05)
     assert share.nodes == 3
-    assert share.for_node(FIRST, sharing=True).taken == pytest.approx(0.15)
+    assert share.for_node(FIRST, sharing=True).taken == pytest.approx(0.25)
     share.drop_node(THIRD)
-    assert (share.nodes, share.wanted, share.for_node(FIRST, sharing=True).taken) == (2, {}, pytest.approx(0.1))
+    assert (share.nodes, share.wanted, share.for_node(FIRST, sharing=True).taken) == (2, {}, pytest.approx(0.2))
     share.drop_node(FIRST)
     assert (share.nodes, share.taken[FIRST]) == (2, 0.2), "its streams run on"
     share.remove_node(FIRST)

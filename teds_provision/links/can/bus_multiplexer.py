@@ -31,6 +31,7 @@ from teds_provision.links.can.isotp import (
     flow,
     read_single,
 )
+from teds_provision.links.can.other_stations import OtherStationsLoad
 from teds_provision.links.can.presses import ButtonPressLog
 from teds_provision.links.can.transfer_pace import TransferPace
 from teds_provision.protocol.announce import Announce, is_announce
@@ -460,6 +461,7 @@ class BusMultiplexer:
         self.own = bus.spec.source
         self.conflicts = AddressConflicts(self.own)
         self.transfer_pace = TransferPace(bus.spec)
+        self.other_stations = OtherStationsLoad(bus.spec)
         self._failure: LinkError | None = None
         self._listeners: tuple[Listener, ...] = ()
         self._asked: tuple[PendingBroadcast, ...] = ()
@@ -588,6 +590,7 @@ class BusMultiplexer:
     def _route(self, frame: Frame) -> None:
         self.conflicts.check_frame(frame)
         self.transfer_pace.count(frame)
+        self.other_stations.count(frame)
         if is_announce(frame.identifier):
             self._hear_announce(frame)
         ends = addresses(frame.identifier)

@@ -191,6 +191,12 @@ class CanPort(MeasuringLink):
         del node
         return CanAirtime(self.spec.bitrate, self.spec.data_bitrate if self.spec.fd else None)
 
+    @property
+    def others_load(self) -> float:
+        """Share of the bus that data for other stations takes now; 0 while the bus is not open."""
+        bus = self._bus
+        return bus.other_stations.load if bus is not None else 0.0
+
     def drive(self, node: int, message: bytes) -> None:
         """Send a Drive message; raises LinkError."""
         identifier = DriveAddress(node, self.spec.source).identifier

@@ -203,6 +203,17 @@ def test_ble_streams_are_whole_notifications_of_their_connection() -> None:
     assert values(message) == [100, 110]
 
 
+def test_the_reply_to_another_session_lets_no_stream_begin() -> None:
+    bench = Bench().open().open("can:f2").operate(1)
+    Consumer(bench, start=bench.hardware.tick + 1, left=False)
+    bench.send(CLOCK, "can:f2")
+    bench.later(100 * MS)
+    assert not bench.frames, "the reply to Subscribe has not left yet"
+    bench.tim.reply_sent("can:f1")
+    bench.later(50 * MS)
+    assert bench.frames
+
+
 def test_notifications_that_are_disabled_end_the_streams_of_their_connection_alone() -> None:
     bench = Bench()
     links = ("ble:2", "ble:3")
