@@ -14,9 +14,18 @@ from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, room
 from teds_provision.node.nfc.tags import ATS, IsoDepTag, NdefApplication, Type4Memory
 from teds_provision.node.nfc.tnep import ExtraRecords, TnepTag, charge_records, out_of_band_record
-from teds_provision.protocol.messages.frames import Command, Function, security_command
+from teds_provision.protocol.messages.frames import (
+    Command,
+    Function,
+    Reason,
+    refusal,
+    security_command,
+    update_teds,
+    write_teds,
+)
 from teds_provision.protocol.operation.commands import PowerReply
 from teds_provision.protocol.wire_agreement import StationAgreement
+from tests.firmware.desk import CDesk
 from tests.firmware.memory_node import MemoryNode
 from tests.firmware.test_beside_python import Twins
 from tests.protocol.desk import CREDENTIALS, NODE, UUID
@@ -339,6 +348,49 @@ def test_half_a_request_and_a_reply_go_with_the_field(taps: Callable[[int, int],
         reader.write(select)
         assert reader.write(more).endswith(payload("01 01 0009 0006 0000", b""))
         reader.activate()
+
+
+@pytest.fixture
+def keyed() -> Iterator[CDesk]:
+    """A node with a tag, in a reader's field, which has agreed on a key there."""
+    desk = CDesk()
+    desk.node.has_nfc()
+    desk.restart()
+    desk.node.nfc_field(True)
+    desk.agree()
+    yield desk
+    CDesk.close_all()
+
+
+def test_the_session_of_a_reader_and_its_request_end_with_the_field(keyed: CDesk) -> None:
+    agreement = StationAgreement(CREDENTIALS, UUID)
+    assert keyed.open().sealed(security_command(Function.IDENTIFY)).ok
+    session = keyed.session
+    assert session is not None
+    assert keyed.plain(agreement.request()).ok
+    keyed.node.nfc_field(False)
+    keyed.node.nfc_field(True)
+    assert keyed.plain(session.seal(security_command(Function.IDENTIFY))) == refusal(Reason.WRONG_STATE)
+    assert keyed.plain(security_command(Function.CONFIRM, bytes(16))) == refusal(Reason.WRONG_STATE)
+
+
+@pytest.mark.parametrize("what", ["state and epoch", "address", "sequence"])
+def test_the_id_record_is_renewed_whenever_identify_changes(keyed: CDesk, what: str) -> None:
+    keyed.open(link="can:f1")
+    keyed.node.nfc_field(False)
+    keyed.node.nfc_field(True)
+    before = keyed.node.nfc_message()
+    if what == "address":
+        keyed.node.take_can_address(99)
+    elif what == "sequence":
+        assert keyed.sealed(write_teds(0, 128, 0, keyed.signed({})), link="can:f1").ok
+        assert keyed.sealed(update_teds(0, 128), link="can:f1").ok
+    else:
+        keyed.agree(link="can:f1", tapped=True)
+    keyed.node.poll()
+    shown = keyed.node.nfc_message()
+    assert shown != before
+    assert tnep.external(message.decode(shown), tnep.ID_TYPE) == keyed.node.identity().encode()
 
 
 @pytest.mark.parametrize("fsdi", [0, 2, 8])
