@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
+from teds_provision.errors import (
+    BadDataError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
+    TedsProvisionError,
+    UsageError,
+)
 from teds_provision.files import read_limited
 from teds_provision.handover.pending import OPEN, BundleNotes, signer_of
 from teds_provision.protocol.handover.jose import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, from_pem, station_key_message, verify
 from teds_provision.station.station import Station
+from teds_provision.station.store.audit import AuditFilter
 from teds_provision.station.store.lock import StoreLock
 from teds_provision.station.store.records import TrustRecord, TrustRole
 from teds_provision.station.store.sqlite import has_store
@@ -232,11 +240,19 @@ def require_ca(station: Station) -> PrivateKey:
     return ca
 
 
-def export_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
-    """Write the CA key to a new file under a passphrase; raises PolicyError, VaultError (token, file)."""
+def export_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> bool:
+    """Write the CA key to a new file under a passphrase; False if the file holds it so already.
+
+    Raises PolicyError, VaultError (token, another file).
+    """
     require_ca(station)
+    if path.exists():
+        with suppress(TedsProvisionError):  # another file, or another passphrase: the vault refuses to replace it
+            require_own_ca(station, path, passphrase)
+            return False
     vault.export_ca(path, passphrase)
     station.audit("ca", None, "exported", ca=fingerprint(station.ca))
+    return True
 
 
 def drop_ca(station: Station) -> bool:
@@ -423,6 +439,26 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
     raise NotFoundError(
         f"No trusted {what} is known as {text!r}.", hint="teds-provision trust add NAME FILE; see trust list"
     )
+
+
+@dataclass(frozen=True)
+class RemovedTrust:
+    """A key that was trusted until it was removed at ``at``."""
+
+    name: str
+    role: str
+    fingerprint: str
+    at: str
+
+
+def find_removed(station: Station, text: str) -> RemovedTrust | None:
+    """Return the key that was last removed under this name, or with these first digits; None if none was."""
+    digits, found = text.replace(" ", "").lower(), None
+    for entry in station.audit_log.chosen(AuditFilter(act="trust")):
+        name, key = str(entry.detail.get("name", "")), str(entry.detail.get("key", ""))
+        if entry.outcome == "removed" and (name == text or (len(digits) >= _MIN_PREFIX and key.startswith(digits))):
+            found = RemovedTrust(name, str(entry.detail.get("role", "")), key, entry.at)
+    return found
 
 
 def _by_digits(known: list[TrustRecord], text: str) -> list[TrustRecord]:

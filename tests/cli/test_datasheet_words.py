@@ -275,6 +275,7 @@ def test_what_ends_with_the_trust_is_listed_before_and_after(
             "bans": [NODE],
             "open_handovers": ["h-1"],
         },
+        "fresh": True,
         "plan": True,
     }
     removed = call(home, "trust", "remove", "lab", "--yes")

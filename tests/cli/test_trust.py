@@ -31,6 +31,13 @@ def unlocked(home: Path, *words: object) -> Outcome:
     return spawn("--home", home, "--json", *words, passphrase=PASSPHRASE)
 
 
+def pem_of_another(folder: Path) -> Path:
+    """Return a file that holds something else."""
+    path = folder / "other.pem"
+    path.write_text("another file")
+    return path
+
+
 def test_add_list_remove(home: Path, pem: Path) -> None:
     assert call(home, "--json", "trust", "add", "lab", pem).code == 6
     plan = call(home, "--json", "trust", "add", "lab", pem, "--dry-run")
@@ -49,7 +56,15 @@ def test_add_list_remove(home: Path, pem: Path) -> None:
     removed = unlocked(home, "trust", "remove", DIGITS[:32], "--yes").json
     assert removed["removed"]["name"] == "lab"
     assert removed["ends"] == {"rotations": [], "cas": [], "nodes_under_them": 0, "bans": [], "open_handovers": []}
-    assert call(home, "--json", "trust", "remove", "lab", "--yes").code == 3
+    for words in (["lab", "--yes"], ["lab"], [DIGITS[:32], "--no-input"], ["lab", "--dry-run"]):
+        again = call(home, "--json", "trust", "remove", *words)
+        assert (again.code, again.json) == (0, removed | {"fresh": False})
+    assert call(home, "trust", "remove", "lab").out.startswith(
+        f"Nothing to do: the station lab, {DIGITS[:32]}, is not trusted any more since 20"
+    )
+    assert call(home, "--json", "trust", "remove", "lap", "--yes").code == 3, "a key that was never trusted"
+    assert unlocked(home, "trust", "add", "lab", pem, "--yes").json["added"] == 1
+    assert call(home, "--json", "trust", "remove", "lab").code == 6, "it is trusted again"
 
 
 def test_the_whole_fingerprint_is_shown_to_compare(home: Path, pem: Path) -> None:
@@ -98,10 +113,13 @@ def test_a_station_without_its_own_ca(home: Path, tmp_path: Path) -> None:
 def test_the_ca_key_away_and_back(home: Path, tmp_path: Path) -> None:
     path = tmp_path / "ca.pem"
     shown = unlocked(home, "trust", "ca", "create").json["fingerprint"]
-    assert unlocked(home, "trust", "ca", "export", path).json == {"file": str(path)}
+    assert unlocked(home, "trust", "ca", "export", path).json == {"file": str(path), "fresh": True}
+    octets = path.read_bytes()
+    assert unlocked(home, "trust", "ca", "export", path).json == {"file": str(path), "fresh": False}
+    other = spawn("--home", home, "--json", "trust", "ca", "export", pem_of_another(tmp_path), passphrase=PASSPHRASE)
+    assert (other.code, path.read_bytes()) == (7, octets)
     assert path.stat().st_mode & 0o777 == 0o600
     assert b"ENCRYPTED" in path.read_bytes()
-    assert unlocked(home, "trust", "ca", "export", path).code == 7
     assert unlocked(home, "trust", "ca", "drop").code == 6
     assert unlocked(home, "trust", "ca", "drop", "--dry-run").json == {"dropped": True, "plan": True}
     assert unlocked(home, "trust", "ca", "create").code == 0, "a plan drops nothing"

@@ -16,17 +16,19 @@ from teds_provision.cli.options import (
     fingerprint_option,
     yes_option,
 )
-from teds_provision.cli.rendering import count_of
-from teds_provision.errors import KeyMismatchError
+from teds_provision.cli.rendering import count_of, local_time
+from teds_provision.errors import KeyMismatchError, NotFoundError
 from teds_provision.files import holds, read_limited, write_new
 from teds_provision.handover import trust as handover_trust
 from teds_provision.handover.trust import (
     MAX_OCTETS,
     Candidate,
     Removal,
+    RemovedTrust,
     candidates_of,
     drop_ca,
     export_ca,
+    find_removed,
     find_trusted,
     import_ca,
     plan_removal,
@@ -177,9 +179,16 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     the nodes that keep them; bans that it issued are lifted.
     """
     station = app.station()
-    record = find_trusted(station, name)
+    try:
+        record = find_trusted(station, name)
+    except NotFoundError:
+        before = find_removed(station, name)
+        if before is None:
+            raise
+        _print_removed(app, before)
+        return
     plan = plan_removal(station, record)
-    result = {"removed": _record(record), "ends": _ends(plan)}
+    result: dict[str, Any] = {"removed": _record(record), "ends": _ends(plan), "fresh": True}
     text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
         app.emit({**result, "plan": True}, "\n".join([f"Plan: stop trusting the {text}.", *_ended(plan)]))
@@ -190,6 +199,17 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     with station.lock("trust remove", app.note):
         done = handover_trust.remove(station, find_trusted(station, name))
     app.emit({**result, "ends": _ends(done)}, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
+
+
+def _print_removed(app: App, before: RemovedTrust) -> None:
+    """Print that a key was removed by an earlier run; nothing ends any more."""
+    ended = {"rotations": [], "cas": [], "nodes_under_them": 0, "bans": [], "open_handovers": []}
+    removed = {"name": before.name, "role": before.role, "fingerprint": before.fingerprint}
+    text = f"{before.role} {before.name}, {before.fingerprint[:32]}"
+    app.emit(
+        {"removed": removed, "ends": ended, "fresh": False},
+        f"Nothing to do: the {text}, is not trusted any more since {local_time(before.at)}.",
+    )
 
 
 def _ends(removal: Removal) -> dict[str, Any]:
@@ -328,8 +348,9 @@ def export(app: App, file: Path) -> None:
     vault = station.vault
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):
-        export_ca(station, vault, file, passphrase)
-    app.emit({"file": str(file)}, f"The CA key is in {file}. Store it offline, then: teds-provision trust ca drop")
+        fresh = export_ca(station, vault, file, passphrase)
+    stored = f"The CA key is in {file}{'' if fresh else ' already'}."
+    app.emit({"file": str(file), "fresh": fresh}, f"{stored} Store it offline, then: teds-provision trust ca drop")
 
 
 @ca.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca drop --yes"))

@@ -1,0 +1,81 @@
+"""A finished command, run again: it changes nothing and exits 0 (docs/contract/cli.md, "Rules")."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.protocol.keys import SoftwareKey, to_pem
+
+from .shell import call
+
+ONE, TWO, BUS = "8d4d9da65281f7000000", "8d4d9da65281f7000001", ("--can", "virtual:again", "--timeout", "0.2")
+
+# In their order: each finds what the ones before it left. FOLDER stands for a folder of the test.
+COMMANDS = (
+    ("whitelist", "add", ONE, "--name", "thumb", "--fingerprint", "ab" * 32),
+    ("whitelist", "add", TWO),
+    ("whitelist", "export", "FOLDER/list.xml"),
+    ("whitelist", "import", "FOLDER/list.xml"),
+    ("group", "create", "hand", ONE),
+    ("group", "add", "hand", TWO),
+    ("group", "remove", "hand", TWO),
+    ("names", "set", ONE, "0", "left"),
+    ("names", "frame", ONE, "0", "tool"),
+    ("names", "reset", ONE, "0"),
+    ("trust", "add", "lab", "FOLDER/lab.pem", "--yes"),
+    ("trust", "add", "owner", "FOLDER/owner.pem", "--role", "ca", "--yes"),
+    ("trust", "remove", "owner", "--yes"),
+    ("trust", "ca", "export", "FOLDER/ca.pem"),
+    ("trust", "ca", "drop", "--yes"),
+    ("trust", "ca", "import", "FOLDER/ca.pem"),
+    ("label", ONE, "--output", "FOLDER/label.svg"),
+    ("config", "set", "can", "socketcan:can0"),
+    ("config", "unset", "can"),
+    ("node", "create", "FOLDER/node", "--profile", "gripper"),
+    ("profile", "new", "mine", "--output", "FOLDER/mine.toml"),
+    ("revoke", TWO, "--why", "stolen", "--yes"),
+    ("revoke", "--lift", TWO, "--yes"),
+    ("whitelist", "remove", TWO, "--yes"),
+    ("group", "delete", "hand", "--yes"),
+    ("draft", "drop", ONE, "--yes"),
+    ("decommission", ONE, "--force", "--yes", *BUS),
+    ("lock",),
+)
+
+
+def rows(home: Path) -> dict[str, Any]:
+    """Return every row of the store but those of the log, which has each run."""
+    with closing(sqlite3.connect(f"file:{home / 'store.sqlite3'}?mode=ro", uri=True)) as database:
+        tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        return {
+            name: sorted(map(repr, database.execute(f"SELECT * FROM {name}")))
+            for name in tables
+            if "audit" not in name and name != "meta" and not name.startswith("sqlite")
+        }
+
+
+def test_a_finished_command_changes_nothing_and_exits_0(home: Path, tmp_path: Path) -> None:
+    (tmp_path / "lab.pem").write_text(to_pem(SoftwareKey(51).point))
+    (tmp_path / "owner.pem").write_text(to_pem(SoftwareKey(52).point))
+    for words in COMMANDS:
+        given = [word.replace("FOLDER", str(tmp_path)) for word in words]
+        first = call(home, "--json", *given)
+        before = rows(home)
+        again = call(home, "--json", *given)
+        assert (first.code, again.code) == (0, 0), (words, first, again)
+        assert rows(home) == before, words
+
+
+@pytest.mark.parametrize("words", [("whitelist", "add"), ("trust", "remove"), ("group", "add")])
+def test_a_plan_of_what_is_finished_says_so_too(home: Path, tmp_path: Path, words: tuple[str, str]) -> None:
+    (tmp_path / "lab.pem").write_text(to_pem(SoftwareKey(51).point))
+    call(home, "group", "create", "hand", ONE)
+    call(home, "trust", "add", "lab", tmp_path / "lab.pem", "--yes")
+    more = {"whitelist": [ONE], "trust": ["lab"], "group": ["hand", ONE]}[words[0]]
+    assert call(home, *words, *more, *(["--yes"] if words[0] == "trust" else [])).code == 0
+    assert call(home, "--json", *words, *more, "--dry-run").code == 0
