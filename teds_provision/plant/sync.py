@@ -18,6 +18,7 @@ from teds_provision.plant import fetching, parcels, removed_members, returned
 from teds_provision.plant.apply_pages import (
     alarm,
     apply_claims,
+    counted_places,
     fold_new_acts,
     merged_views,
     now,
@@ -465,8 +466,10 @@ def _push(station: Station, transport: Transport, roster: Roster, done: SyncResu
             {hash_of(carried.octets) for carried in transport.pages(fingerprint, 0)} if transport.carries_all else set()
         )
         above = 0 if transport.carries_all else heads.get(fingerprint, 0)
+        # a registry takes one history: pages that `registry resume` gave up stay here, even if their number is free
+        counting = None if transport.carries_all else counted_places(station, roster, chain)
         for n, hash, previous in station.plant.pages.chain_links(chain.id):
-            if n <= above or hash in there or (own and not transport.carries_all and n > chain.counted[0]):
+            if n <= above or hash in there or (counting is not None and (n, hash) not in counting):
                 continue
             row = station.plant.pages.get(chain.id, n, hash)
             assert row is not None

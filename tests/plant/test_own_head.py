@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
+from teds_provision import plant
 from teds_provision.errors import ForkError, LinkError, PolicyError
 from teds_provision.plant.apply_pages import alarm
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.plant.sync import SyncResult, acknowledge, resume, sync
+from teds_provision.plant.sync import SyncResult, acknowledge, own_chain, resume, sync
 from teds_provision.plant.transport import CarriedPage
+from teds_provision.protocol.plant.document import hash_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant, ask
@@ -233,3 +237,87 @@ def test_pages_that_another_home_wrote_stop_everything_until_a_person_decides(
     west.sync()
     assert alarms(west.station) == []
     assert west.file(2).exists()
+
+
+def test_a_rebuilt_home_goes_on_if_only_a_removed_station_or_its_own_newest_page_is_reported(west: West) -> None:
+    south = west.plants.member("south", "base")
+    west.page()
+    west.plants.change(plant.owner.draft_removal(west.plants.north, "south", "lost", 0))
+    west.plants.sync(west.plants.north)
+    back = west.copy()
+    west.sync(back, connected=False)  # it takes the roster, and does not know of the registry yet
+    back.plant.begin_restored()
+    chain = own_chain(back)
+    with back.transaction():
+        pages = back.plant.pages
+        pages.put_heads(pages.chain(south.fingerprint).id, {back.fingerprint: (9, "ab" * 32)})
+        pages.put_heads(pages.chain(west.plants.north.fingerprint).id, {back.fingerprint: chain.counted})
+    west.write(back)
+    west.sync(back)
+    assert not back.plant.restored
+    assert own_chain(back).counted[0] == chain.counted[0] + 1
+
+
+def test_a_decision_makes_another_home_of_it_that_has_nothing_acknowledged(west: West) -> None:
+    west.page()
+    another_wrote(west)
+    with pytest.raises(ForkError):
+        west.sync()
+    home, joined = west.station.plant.home, west.station.plant.joined
+    assert joined is not None
+    assert joined.acknowledged == 1
+    resume(west.station, Registry(west.stick))
+    joined = west.station.plant.joined
+    assert joined is not None
+    assert joined.acknowledged == 0
+    assert west.station.plant.home != home, "a copy that is found later can be told from it"
+    west.sync()
+    page = next(west.station.plant.pages.each(own_chain(west.station).id, 2))
+    assert page.home == west.station.plant.home
+
+
+def test_what_a_lost_page_said_is_said_again_but_for_what_the_adopted_pages_have(west: West) -> None:
+    west.page()
+    west.write()  # both homes publish this
+    copy = west.copy("copy", restored=False)
+    west.sync(copy)
+    elsewhere = west.plants.folder / "elsewhere"
+    elsewhere.mkdir()
+    for _ in range(3):
+        west.write()
+        west.sync(connected=False, folder=elsewhere)
+    assert west.station.plant.outbox(9) == []
+    assert own_chain(west.station).counted[0] == 4
+    with pytest.raises(ForkError):
+        west.sync()
+    assert resume(west.station, Registry(west.stick)) == 1
+    waiting = [json.loads(text) for _, _, text in west.station.plant.outbox(9)]
+    assert [one["uuid"] for one in waiting if one["act"] == "pinned"] == ["03" * 10, "04" * 10, "05" * 10]
+    adopted = own_chain(west.station).counted
+    assert adopted[0] == 2
+    assert west.sync().pushed == 1, "no page of the history that was given up"
+    newest = own_chain(west.station).counted
+    row = west.station.plant.pages.get(own_chain(west.station).id, *newest)
+    assert row is not None
+    assert (row.n, row.previous) == (3, adopted[1])
+    joined_by(west.station, "postgresql://plant")
+    assert west.station.plant.unsent() == 0
+    west.write()
+    assert west.station.plant.unsent() == 1
+    assert hash_of(west.file(3).read_bytes().strip()) == newest[1]
+
+
+def test_a_sync_reports_a_roster_that_it_refuses_and_posts_its_own(west: West) -> None:
+    west.sync()
+    held = west.station.plant.roster
+    assert held is not None
+    ahead = replace(
+        plant.owner.following(west.plants.north, expires=held.created + timedelta(days=399)),
+        created=held.created + timedelta(days=30),
+    )
+    elsewhere = west.plants.folder / "elsewhere"
+    (elsewhere / "roster").mkdir(parents=True)
+    (elsewhere / "roster/9.jws").write_bytes(plant.owner.signed(west.plants.north, ahead).octets)
+    (remark,) = west.sync(connected=False, folder=elsewhere).remarks
+    assert remark.startswith(f"roster {held.version + 1}: refused: it is dated in the future")
+    assert (elsewhere / f"roster/{held.version}.jws").read_bytes().strip() == held.octets

@@ -324,8 +324,11 @@ class Plant:
         record, chain = self.record(), self.pages.chains().get(self._identity.fingerprint)
         if record is None or record.url is None or chain is None:
             return waiting
-        pages = self.pages.each(chain.id, record.acknowledged)
-        return waiting + sum(len(json.loads(page.content).get("events", ())) for page in pages)
+        place = chain.counted  # from here back: pages of a history that was given up are not sent
+        while place[0] > record.acknowledged and (page := self.pages.get(chain.id, *place)) is not None:
+            waiting += len(json.loads(page.content).get("events", ()))
+            place = page.n - 1, page.previous
+        return waiting
 
     def drop_events(self, ids: Iterable[str]) -> None:
         """Remove events that a page contains from the outbox."""
