@@ -106,6 +106,18 @@ def test_of_several_nodes_the_first_is_on_top_and_all_are_listed(home: Path, sta
     assert found == every[0]
 
 
+@pytest.mark.parametrize(("link", "listed"), [(("--can", "virtual:x"), True), (("--ble", "hci0"), True), (NFC, False)])
+def test_over_a_bus_all_are_listed_if_there_is_one_too(
+    home: Path, stand_in: Any, link: tuple[str, str], listed: bool
+) -> None:
+    """A script that reads ``nodes`` of a bus works on a bus of one node."""
+    stand_in(provisioning.identify, "identify_at", [arrival(proven())])
+    found = call(home, "--json", "identify", *link).json
+    nodes = found.pop("nodes", None)
+    assert nodes == ([found] if listed else None)
+    assert found["uuid"] == NODE
+
+
 def test_who_watches_gets_a_line_a_node_and_one_that_fails_ends_nothing(home: Path, stand_in: Any) -> None:
     bad = arrival(None, NotAuthenticError("It cannot prove its key.", hint="Set it aside."), OTHER)
     stand_in(provisioning.identify, "identify_at", [bad, arrival(proven())])

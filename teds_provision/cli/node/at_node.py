@@ -13,7 +13,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import firmware_words, reporter_for
 from teds_provision.errors import UsageError
-from teds_provision.links import LinkSettings, Notice
+from teds_provision.links import LINKS, LinkSettings, Notice
 from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.protocol.messages.firmware import LOCATE_SECONDS
 from teds_provision.provisioning.progress import Reporter, StepResult
@@ -35,7 +35,7 @@ from teds_provision.station.store.records import utc_now
 def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bool, dry_run: bool) -> None:
     """Wait for a tap, read the node's UUID and key, and have it prove that it holds the key.
 
-    With --via can, every node on the bus is asked; --json lists several under "nodes". A board whose button is pressed
+    With --via can, every node on the bus is asked; --json lists them under "nodes". A board whose button is pressed
     meanwhile says so.
     """
     if locating:
@@ -64,7 +64,8 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bo
     if locating:
         _locate_each(app, links, found, reporter)
     elif not watch:
-        _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
+        listed = len(found) > 1 or LINKS[links.via].capabilities.many
+        _emit(app, {**found[0], "nodes": found} if listed else found[0])
 
 
 class PressLines:
