@@ -188,7 +188,7 @@ def test_drafts_and_earlier_datasheets_are_listed(home: Path) -> None:
     assert call(home, "draft", "list").out == "There are no drafts.\n"
     assert call(home, "history", NODE).out == f"No datasheets are known for node {NODE}.\n"
     none, found = both(home, "draft", "drop", NODE)
-    assert (none.out, found) == (f"Node {NODE} has no draft.\n", {"uuid": NODE, "dropped": False})
+    assert (none.out, found) == (f"Node {NODE} has no draft.\n", {"uuid": NODE, "dropped": False, "drafts": []})
     records = [
         DatasheetRecord(UUID, 1, 2, None, None, AT, "ab" * 32, IMAGE),
         DatasheetRecord(UUID, 12, 3, AT, "gripper", "2026-02-01T00:00:00Z", "cd" * 32, IMAGE),
@@ -267,6 +267,7 @@ def test_what_ends_with_the_trust_is_listed_before_and_after(
     people, found = both(home, "trust", "remove", "lab", "--dry-run")
     assert people.out.splitlines() == [f"Plan: stop trusting the station lab, {DIGITS[:32]}.", *lines]
     assert found == {
+        "trusted": [{"name": "lab", "role": "station", "fingerprint": DIGITS}],
         "removed": {"name": "lab", "role": "station", "fingerprint": DIGITS},
         "ends": {
             "rotations": [uuid.hex() for uuid in shared],

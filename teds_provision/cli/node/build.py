@@ -12,7 +12,7 @@ import click
 
 from teds_provision import provisioning
 from teds_provision import teds as teds_room
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.named_files import write_file
 from teds_provision.cli.options import (
     CalibrationFile,
@@ -367,15 +367,19 @@ def draft() -> None:
 @pass_app
 def list_(app: App) -> None:
     """List every draft: node, stage and profile."""
-    drafts = [
-        {"uuid": draft.uuid.hex(), "profile": draft.profile, "stage": draft.stage, "created": draft.created}
-        for draft in app.station().datasheets.drafts()
-    ]
+    drafts = _drafts(app.station())
     lines = [
         f"{draft['uuid']}  {draft['stage']:<6}  {local_time(str(draft['created']))}  {draft['profile'] or ''}".rstrip()
         for draft in drafts
     ]
     app.emit({"drafts": drafts}, "\n".join(lines) or "There are no drafts.")
+
+
+def _drafts(station: Station) -> list[dict[str, Any]]:
+    return [
+        {"uuid": draft.uuid.hex(), "profile": draft.profile, "stage": draft.stage, "created": draft.created}
+        for draft in station.datasheets.drafts()
+    ]
 
 
 @command("teds-provision draft drop 8d4d")
@@ -386,13 +390,14 @@ def list_(app: App) -> None:
 def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Drop a node's draft; the datasheet on the node is not affected."""
     del yes  # not needed: the draft can be built again
-    done = provisioning.datasheet_history.drop_draft(app.station(), uuid, dry_run=dry_run)
-    node = done.uuid.hex()
+    station = app.station()
+    done = provisioning.datasheet_history.drop_draft(station, uuid, dry_run=dry_run)
+    node, drafts = done.uuid.hex(), _drafts(station)
     if done.draft is None:
-        app.emit({"uuid": node, "dropped": False}, f"Node {node} has no draft.")
+        app.emit({"uuid": node, "dropped": False, "drafts": drafts}, f"Node {node} has no draft.")
         return
     text = f"{'Plan: drop' if dry_run else 'Dropped'} the {done.draft.stage} draft of node {node}."
-    app.emit({"uuid": node, "dropped": not dry_run}, text)
+    app.emit({"uuid": node, "dropped": not dry_run, "drafts": drafts}, text)
 
 
 draft.add_command(list_, "list")

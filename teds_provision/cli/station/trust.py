@@ -185,10 +185,11 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
         before = find_removed(station, name)
         if before is None:
             raise
-        _print_removed(app, before)
+        _print_removed(app, station, before)
         return
     plan = plan_removal(station, record)
-    result: dict[str, Any] = {"removed": _record(record), "ends": _ends(plan), "fresh": True}
+    result: dict[str, Any] = {"trusted": _trusted(station), "removed": _record(record), "ends": _ends(plan)}
+    result["fresh"] = True
     text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
         app.emit({**result, "plan": True}, "\n".join([f"Plan: stop trusting the {text}.", *_ended(plan)]))
@@ -198,16 +199,21 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     station.unlock()
     with station.lock("trust remove", app.note):
         done = handover_trust.remove(station, find_trusted(station, name))
-    app.emit({**result, "ends": _ends(done)}, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
+    result |= {"trusted": _trusted(station), "ends": _ends(done)}
+    app.emit(result, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
 
 
-def _print_removed(app: App, before: RemovedTrust) -> None:
+def _trusted(station: Station) -> list[dict[str, str]]:
+    return [_record(record) for record in station.policy.listed()]
+
+
+def _print_removed(app: App, station: Station, before: RemovedTrust) -> None:
     """Print that a key was removed by an earlier run; nothing ends any more."""
     ended = {"rotations": [], "cas": [], "nodes_under_them": 0, "bans": [], "open_handovers": []}
     removed = {"name": before.name, "role": before.role, "fingerprint": before.fingerprint}
     text = f"{before.role} {before.name}, {before.fingerprint[:32]}"
     app.emit(
-        {"removed": removed, "ends": ended, "fresh": False},
+        {"trusted": _trusted(station), "removed": removed, "ends": ended, "fresh": False},
         f"Nothing to do: the {text}, is not trusted any more since {local_time(before.at)}.",
     )
 
