@@ -125,6 +125,32 @@ def test_a_node_is_told_the_time_every_third_of_its_lease(monkeypatch: pytest.Mo
     assert told == [1.0, 2.0, 3.0, 4.0]
 
 
+def test_a_node_is_tried_again_after_1_s_doubling_to_30_and_after_a_long_run_from_1_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, pauses = [0.0], list[float]()
+    supervisor = supervisor_at(now, monkeypatch, patient=True)
+    monkeypatch.setattr(supervisor, "_set_state", lambda *_what, **_why: None)
+    monkeypatch.setattr(supervisor, "_buses", SimpleNamespace(all=list))
+    monkeypatch.setattr(supervisor, "_anew", SimpleNamespace(clear=lambda: None))
+    lasts = [0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 30.0, 30.1, 0.0]
+
+    def failure() -> LinkError:
+        now[0] += lasts[len(pauses)]
+        return LinkError("It is gone.")
+
+    def wait(pause: float, began: float, *, decided: bool) -> None:
+        assert (began, decided) == (now[0] - lasts[len(pauses)], False)
+        pauses.append(pause)
+        if len(pauses) == len(lasts):
+            supervisor._stop.set()
+
+    monkeypatch.setattr(supervisor, "_failure", failure)
+    monkeypatch.setattr(supervisor, "_wait", wait)
+    supervisor._run()
+    assert pauses == [1, 2, 4, 8, 16, 30, 30, 1, 2]
+
+
 def test_a_node_that_was_given_back_is_lent_no_more() -> None:
     """It would never be let go when it is lost later, and not join again."""
     station: Any = None

@@ -2326,6 +2326,49 @@ PATTERNS = (
         "True",
         "tests/node/test_wrapped_dbc.py",
     ),
+    # operation.md, sentence by sentence: what no test noticed
+    Pattern(
+        "a trigger that marks stops no actuator",
+        "StreamRole.trigger",
+        "action == Action.STOP",
+        "True",
+        "tests/protocol/operation/test_triggers.py",
+    ),
+    Pattern(
+        "a stream ends with a claim of its own channels alone",
+        "StreamRole.claims_ended",
+        "s.session is session and channels.intersection(s.channels)",
+        "s.session is session",
+        "tests/protocol/operation/test_streams.py",
+    ),
+    Pattern(
+        "a gap of 0 counts as a microsecond in the budget",
+        "_share",
+        "[1, asked.gap, *(stream.asked.gap for stream in there)]",
+        "[0, asked.gap, *(stream.asked.gap for stream in there)]",
+        "tests/protocol/operation/test_refusals.py",
+    ),
+    Pattern(
+        "the claim of an actuator shortens no lease",
+        "claim",
+        "max(lease, trusted.lease.seconds)",
+        "lease",
+        "tests/measure/test_held_actuator.py",
+    ),
+    Pattern(
+        "data for other stations counts in the share of a bus",
+        "BusShare._taken_by_others",
+        "self.time.taken + self.others()",
+        "self.time.taken",
+        "tests/links/can/test_other_stations.py",
+    ),
+    Pattern(
+        "a node whose mark is not the frame's is not started",
+        "_mark",
+        "not mark or not mark_is_honest(mark, TickBounds(low, high))",
+        "not mark",
+        "tests/measure/test_trigger.py",
+    ),
     # the draw of 65: what no test noticed
     Pattern(
         "a value goes out with its variance",

@@ -298,6 +298,8 @@ def test_what_stop_takes_back_after_the_end_of_the_measurement_is_not_lost(
         assert taker.open_message(sealed(counter), LATER)
     taker.finish(9, wanted)
     counted(taker, good=6, lost=lost, cut=cut)
+    assert taker.open_message(sealed(8), LATER) is None
+    counted(taker, good=6, lost=lost, cut=cut, late=1)
 
 
 def test_a_stop_that_counts_less_than_came_lets_no_message_count_twice() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from teds_provision.protocol.messages.frames import Command, Function, Reason, security_command
@@ -401,6 +403,26 @@ def test_outside_a_session_they_get_3() -> None:
         found = {number: bench.plain(R(0, *number, b"\1"), link).reason for number in numbers}
         assert found == dict.fromkeys(numbers, Reason.NOT_PERMITTED)
     assert bench.plain(R(0, 128, 21)).reason == Reason.UNKNOWN_COMMAND
+
+
+def test_the_firmwares_shortest_period_counts_beside_that_of_the_teds() -> None:
+    """The longest of both, of every channel of the stream."""
+    bench = Bench(teds={(2, 3): channel_teds(channels()[2], period=0.001)})
+    facts = bench.hardware.channels
+    bench.hardware.channels = {**facts, 1: replace(facts[1], shortest=20 * MS), 2: replace(facts[2], shortest=5000)}
+    bench.restart()
+    bench.open().operate(1, 2)
+    sent(
+        bench,
+        [
+            ("shorter than the firmware's", subscribe(period=20 * MS - 1), U.OUT_OF_RANGE),
+            ("of the first of two", subscribe(period=20 * MS - 1, channels=(1, 2)), U.OUT_OF_RANGE),
+            ("of the second of two", subscribe(period=20 * MS - 1, channels=(2, 1)), U.OUT_OF_RANGE),
+            ("the firmware's", subscribe(period=20 * MS, channels=(1, 2)), None),
+            ("shorter than the TEDS's, not than the firmware's", subscribe(period=998 * 1000, channels=(2,)), 19),
+            ("the TEDS's", subscribe(period=1 * MS, channels=(2,)), None),
+        ],
+    )
 
 
 def test_a_gap_of_0_counts_as_one_microsecond() -> None:
