@@ -264,3 +264,5 @@ def test_a_charging_reader_that_writes_its_power_disturbs_nothing(desk: Desk) ->
         message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])
     ) == message.decode(before)
     assert tnep.status_of(desk.exchange(select())) == tnep.SUCCESS
+    power = message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])
+    assert tnep.status_of(desk.exchange(power)) == tnep.PROTOCOL_ERROR, "a reader that has selected asks"

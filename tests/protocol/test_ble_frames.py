@@ -31,7 +31,9 @@ def test_frames_as_they_stand_on_the_air() -> None:
     ]
 
 
-@pytest.mark.parametrize("fault", ["missing", "doubled", "swapped", "other transaction", "other total", "too much"])
+@pytest.mark.parametrize(
+    "fault", ["missing", "doubled", "swapped", "other transaction", "other total", "too much", "too short"]
+)
 def test_a_frame_that_does_not_continue_drops_its_message_and_no_other(fault: str) -> None:
     message = bytes(range(60))
     frames, assembly = list(cut(7, message, 23)), BleAssembly(1024)
@@ -47,6 +49,8 @@ def test_a_frame_that_does_not_continue_drops_its_message_and_no_other(fault: st
             hurt[2] = bytes([0, 8]) + hurt[2][2:]
         case "other total":
             hurt[2] = hurt[2][:3] + bytes([61]) + hurt[2][4:]
+        case "too short":
+            hurt.insert(2, hurt[2][:5])
         case _:
             hurt[-1] += bytes(9)
     assert not [found for frame in hurt if (found := assembly.add_frame(frame)) is not None]

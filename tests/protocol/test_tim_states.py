@@ -276,6 +276,20 @@ def test_reset_by_hand_has_the_same_effect() -> None:
     assert by_hand.agree().flash.epoch == 2
 
 
+@pytest.mark.parametrize("by", ["command", "hand"])
+def test_a_reset_keeps_the_address(by: str) -> None:
+    desk = Desk().agree()
+    assert desk.plain(address(0x21)).ok
+    if by == "hand":
+        desk.tim.reset_by_hand()
+    else:
+        assert desk.open().sealed(COMMANDS["reset"]).ok
+    assert desk.tim.identity().state == NodeState.FACTORY
+    assert desk.tim.identity().can_address == 0x21
+    desk.restart()
+    assert desk.tim.identity().can_address == 0x21
+
+
 def test_a_reset_node_takes_another_owner() -> None:
     desk = Desk().provision()
     desk.sealed(COMMANDS["reset"])

@@ -96,6 +96,24 @@ def test_tnep_records_never_raise_anything_but_garbled(payload: bytes) -> None:
             tnep.selection(found)
 
 
+def test_our_service_is_found_among_others_and_is_of_tnep_1_in_single_response_mode() -> None:
+    def tp(head: str, uri: bytes, tail: str) -> NdefRecord:
+        return NdefRecord(WELL_KNOWN, b"Tp", bytes.fromhex(head) + bytes([len(uri)]) + uri + bytes.fromhex(tail))
+
+    own = b"urn:nfc:xsn:teds-provision:tim"
+    good = tp("10", own, "00 04 0f 0200")
+    found = tnep.ServiceParameters(own, wt_int=4, n_wait=15, max_ndef=512)
+    assert tnep.our_service([good]) == found
+    assert found.t_wait == 0.001
+    broken, other = NdefRecord(WELL_KNOWN, b"Tp", b"\x10\x05abc"), tp("10", b"urn:nfc:sn:handover", "00 04 0f 0200")
+    assert tnep.our_service([NdefRecord(WELL_KNOWN, b"T", b""), broken, other, good]) == found
+    newer = tnep.our_service([tp("1f", own, "00 04 ff 0200")])
+    assert newer is not None
+    assert (newer.version, newer.n_wait) == (0x1F, 15), "no more than TNEP has"
+    for no_service in (tp("20", own, "00 04 0f 0200"), tp("10", own, "01 04 0f 0200"), broken, other):
+        assert tnep.our_service([no_service]) is None
+
+
 def test_a_payload_record_has_the_layout_of_the_profile() -> None:
     octets = Piece(0x1234, 0x0102, 0x0100, b"\xaa\xbb", answer=True).encode()
     head = bytes.fromhex("01 01 1234 0102 0100")

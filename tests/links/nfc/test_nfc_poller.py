@@ -30,9 +30,9 @@ class Script:
     def sleep(self, seconds: float) -> None:
         self.now += seconds
 
-    def transact(self, *, wt_int: int = 20, n_wait: int = 15, max_ndef: int = 300) -> bytes:
+    def transact(self, *, wt_int: int = 20, n_wait: int = 15, max_ndef: int = 300, frame: bytes = b"abcd") -> bytes:
         service = tnep.ServiceParameters(tnep.SERVICE, wt_int, n_wait, max_ndef)
-        return Poller(self, service, clock=lambda: self.now, sleep=self.sleep).transact(3, b"abcd")
+        return Poller(self, service, clock=lambda: self.now, sleep=self.sleep).transact(3, frame)
 
 
 OK = message.encode([tnep.status(0)])
@@ -46,6 +46,7 @@ GOOD = answer(Piece(3, 2, 0, b"ok", answer=True))
     [
         [b"", b"", OK, b"", GOOD],
         [select(), OK, request(Piece(3, 4, 0, b"abcd")), GOOD],  # our own message still there
+        [*[select()] * 9, OK, *[request(Piece(3, 4, 0, b"abcd"))] * 9, GOOD],  # and still there at each read
         [OK, b"\xd1torn", GOOD],
         [OK, GOOD[:-3], GOOD],
         [OK, answer(Piece(2, 2, 0, b"no", answer=True)), GOOD],  # another transaction
@@ -64,6 +65,29 @@ def test_a_station_waits_before_its_first_read_too(wt_int: int) -> None:
     script = Script(OK, b"", GOOD)
     script.transact(wt_int=wt_int)
     assert script.read_at == pytest.approx([2 ** (wt_int / 4 - 1) / 1000 * reads for reads in (1, 2, 3)])
+
+
+@pytest.mark.parametrize(
+    ("wt_int", "n_wait", "milliseconds"),
+    [
+        (4, 2, [1, 2, 3, 5, 9, 17, 33, 65, 97, 129]),  # from the third read on twice as long, up to 32 ms
+        (4, 0, [1, 3, 7, 15, 31, 63, 95, 127, 159, 191]),
+        (32, 0, [128 * reads for reads in range(1, 11)]),  # never shorter than the node's own
+    ],
+)
+def test_past_n_wait_a_station_reads_less_and_less_often(wt_int: int, n_wait: int, milliseconds: list[int]) -> None:
+    script = Script(b"")
+    with pytest.raises(NodeSilentError):
+        script.transact(wt_int=wt_int, n_wait=n_wait)
+    assert [round(1000 * at) for at in script.read_at[:10]] == milliseconds
+
+
+def test_a_message_is_as_long_as_the_tag_takes_and_no_longer() -> None:
+    for max_ndef in (60, 200, 288, 289, 300):
+        script = Script(OK, *[answer(Piece(3, 1000, at, b"", answer=True)) for at in range(0, 30000, 40)])
+        with pytest.raises((GarbledError, NodeSilentError)):
+            script.transact(wt_int=4, max_ndef=max_ndef, frame=bytes(1000))
+        assert max(map(len, script.written)) == max_ndef
 
 
 @pytest.mark.parametrize("wt_int", [0, 4, 20, 36, 44])
