@@ -20,10 +20,12 @@ from teds_provision.cli.rendering import LineReporter, LiveReporter, reporter_fo
 from teds_provision.cli.terminal_operator import TerminalOperator
 from teds_provision.errors import NotWhitelistedError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
 from teds_provision.provisioning.batch_sheet import DeclinedError
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import Holder
 from tests.bench import PASSPHRASE
 from tests.parsed import parsed
 
@@ -309,3 +311,47 @@ def test_a_spare_takes_over_what_the_person_was_asked_about_or_nothing(
     assert found == {UUID: ("knee", None), spare: (None, None)}
     done = call(home, "--json", "replace", UUID, spare, "--yes")
     assert (done.code, done.json["name"], done.json["fresh"]) == (0, "knee", True)
+
+
+def test_a_key_is_distrusted_and_a_ban_lifted_as_the_person_was_asked_or_not(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While a person thinks, another command may give the name to another key, or ban the node for something else."""
+    for name, secret in (("lab", 41), ("west", 42)):
+        (tmp_path / f"{name}.pem").write_text(to_pem(SoftwareKey(secret).point))
+    call(home, "trust", "add", "lab", tmp_path / "lab.pem", "--yes")
+    call(home, "revoke", UUID, "--why", "lost", "--yes")
+
+    def refused(words: Sequence[str], *meanwhile: Sequence[object] | Holder) -> bool:
+        def confirm(_app: App, _question: str, *, yes: bool) -> None:
+            assert yes
+            for other in meanwhile:
+                if isinstance(other, Holder):
+                    with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as station, station.transaction():
+                        station.keys.put_holder(other)
+                    continue
+                with monkeypatch.context() as same:
+                    same.setattr(App, "confirm", lambda _app, _question, *, yes: None)
+                    assert call(home, *other).code == 0
+
+        with monkeypatch.context() as patch:
+            patch.setattr(App, "confirm", confirm)
+            outcome = call(home, "--json", *words, "--yes")
+        return outcome.code == 6 and outcome.json["error"]["message"] == (
+            "Another command changed the plan while this one was waiting."
+        )
+
+    west = fingerprint(SoftwareKey(42).point)
+    assert refused(
+        ["trust", "remove", "lab"],
+        ["trust", "remove", "lab", "--yes"],
+        ["trust", "add", "lab", tmp_path / "west.pem", "--yes"],
+    )
+    trusted = call(home, "--json", "trust", "list").json["trusted"]
+    assert [key["fingerprint"] for key in trusted if key["name"] == "lab"] == [west]
+    assert refused(["trust", "remove", "lab"], Holder(bytes.fromhex(UUID), west, "2026-11-28T00:00:00Z"))
+    again = (["revoke", "--lift", UUID, "--yes"], ["revoke", UUID, "--why", "cloned", "--yes"])
+    assert refused(["revoke", "--lift", UUID], *again)
+    assert call(home, "--json", "revoke", "--lift", UUID, "--dry-run").json["why"] == "cloned"
+    assert not refused(["trust", "remove", "lab"])
+    assert not refused(["revoke", "--lift", UUID])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import click
 import pytest
 
 from teds_provision.cli.config_file import Defaults
+from teds_provision.cli.context import App
 from teds_provision.cli.measure.sample import over_the_bus
-from teds_provision.cli.options import link_options
+from teds_provision.cli.options import link_options, links_given, readers_for
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import pcsc_readers, reader
@@ -73,6 +75,63 @@ def test_who_names_a_time_has_the_nodes_collected_for_so_long() -> None:
     ):
         links = given(kept, *typed)
         assert (links.timeout, links.listen) == seconds, (kept, typed)
+
+
+def test_replace_and_import_keys_meet_a_node_if_any_link_is_named() -> None:
+    for kept, typed, meets in (
+        ({}, [], False),
+        ({}, ["--timeout", "9"], False),
+        ({}, ["--via", "nfc"], True),
+        ({}, ["--nfc", READER], True),
+        ({}, ["--can", BUS], True),
+        ({}, ["--ble", AIR], True),
+        ({"ble": AIR}, [], True),
+    ):
+        found: list[bool] = []
+
+        def noted(links: LinkSettings, found: list[bool] = found) -> LinkSettings:
+            found.append(links_given(click.get_current_context()))
+            return links
+
+        given(kept, *typed, read=noted)
+        assert found == [meets], (kept, typed)
+
+
+def test_only_who_reads_tags_borrows_the_readers_of_the_base_station(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, none = tmp_path / "runs", tmp_path / "none"
+    for folder in (runs, none):
+        folder.mkdir()
+    (runs / "ncap.sock").touch()
+    asked: list[Path] = []
+
+    class Neighbour:
+        """A client that notes what it borrows, and when it gives it back."""
+
+        @contextmanager
+        def readers(self) -> Iterator[bool]:
+            asked.append(runs)
+            yield True
+            asked.append(none)
+
+    def connect(home: Path) -> Neighbour:
+        assert home == runs
+        return Neighbour()
+
+    monkeypatch.setattr("teds_provision.client.connect", connect)
+    for via, home, borrows in (
+        ("nfc", runs, 1),
+        ("nfc", none, 0),
+        ("can", runs, 0),
+        ("ble", runs, 0),
+        ("nfc", None, 0),
+    ):
+        monkeypatch.setattr(App, "current", None if home is None else App(home=home))
+        with readers_for(via):
+            assert len(asked) == borrows, (via, home)
+        assert len(asked) == 2 * borrows, (via, home)
+        asked.clear()
 
 
 def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

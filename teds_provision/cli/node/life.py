@@ -77,6 +77,7 @@ def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) 
     station.unlock()
     app.confirm(f"Lift the ban on node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
     with station.lock("revoke --lift", app.note):
+        require_same(station.policy.revocation(uuid) == entry)
         deny.lift(station, uuid)
     app.emit(result, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
 

@@ -17,6 +17,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import count_of, local_time
+from teds_provision.cli.station.handover import require_same
 from teds_provision.errors import KeyMismatchError, NotFoundError
 from teds_provision.files import holds, read_limited, write_new
 from teds_provision.handover import trust as handover_trust
@@ -198,7 +199,8 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     app.confirm(f"Stop trusting the {text}?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
-        done = handover_trust.remove(station, find_trusted(station, name))
+        require_same(find_trusted(station, name) == record and plan_removal(station, record) == plan)
+        done = handover_trust.remove(station, record)
     result |= {"trusted": _trusted(station), "ends": _ends(done)}
     app.emit(result, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
 
