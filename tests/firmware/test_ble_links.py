@@ -7,12 +7,16 @@ from collections.abc import Iterator
 import pytest
 
 from teds_provision.protocol.messages import ble
+from teds_provision.protocol.messages.firmware import ABOUT, FirmwareReport
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Command,
+    Function,
     Reason,
     Reply,
     decode_reply,
+    query_teds,
+    read_teds,
     refusal,
     security_command,
     update_teds,
@@ -28,7 +32,7 @@ pytestmark = pytest.mark.system
 class Air(CDesk):
     """A node in the air; ``write`` sends a plain command over a connection as a station does."""
 
-    transaction = 0
+    transaction, report = 0, b""
 
     def write(self, connection: int, command: Command, *, again: bool = False) -> Reply:
         self.transaction += not again
@@ -111,3 +115,32 @@ def test_a_reply_is_kept_for_20_seconds_from_its_end(air: Air) -> None:
     assert air.node.ble_written(0, frame) == reply
     air.now += 20.0
     assert air.node.ble_written(0, frame) != reply
+
+
+def test_questions_are_answered_anew_each_time_by_what_is_so_now(air: Air) -> None:
+    """Identify, Query, Read, List, Prove and About: their stored reply is never given."""
+    air.node.has_firmware(lambda what, _argument, _octets: air.report if what == "a" else b"")
+    air.restart()
+    for connection in (0, 1):
+        air.node.ble_connected(connection, 247)
+    air.report = FirmwareReport("board/app", (1, 2, 3)).encode()[1:]
+    assert b"board/app" in air.write(0, ABOUT).payload
+    air.report = FirmwareReport("board/other", (1, 2, 4)).encode()[1:]
+    assert b"board/other" in air.write(0, ABOUT, again=True).payload
+    assert air.write(0, IDENTIFY).payload[-1] == 192
+    air.node.take_can_address(99)
+    assert air.write(0, IDENTIFY, again=True).payload[-1] == 99
+    for question in (query_teds(0, 128), read_teds(0, 128, 0)):
+        before = air.write(0, question)
+        air.agree()
+        after = air.write(0, question, again=True)
+        assert before != after == air.plain(question)
+    question = security_command(Function.LIST)
+    assert air.write(0, question).payload == b"\0\0\x80"
+    air.open()
+    assert air.commit({(1, 12): NAME}).ok
+    assert air.write(0, question, again=True).payload == b"\0\0\x80\0\1\x0c"
+    prove = security_command(Function.PROVE, bytes(32))
+    assert air.write(0, prove).ok
+    air.node.chip_fails(1)
+    assert air.write(0, prove, again=True) == refusal(Reason.FLASH_FAILURE), "its chip was asked again"

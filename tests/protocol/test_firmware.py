@@ -77,6 +77,7 @@ def test_the_published_reports_mean_what_the_file_states(vector: dict[str, Any])
         return
     report = FirmwareReport.decode(payload)
     assert meaning(report) == vector["means"]
+    assert FirmwareReport.decode(payload[:1] + bytes([payload[1] | 0xC0]) + payload[2:]) == report, "bits 6 and 7"
     assert report.encode() == payload[:1] + bytes([payload[1] & 0x3F]) + payload[2:]
 
 

@@ -271,7 +271,19 @@ def test_a_write_of_what_can_never_be_held_gets_18(desk: Desk) -> None:
     assert desk.sealed(write_teds(0, 18, 0, b"x")) == refusal(Reason.NO_SUCH_TEDS)
 
 
-@pytest.mark.parametrize("teds", [NAME[:-1] + bytes([NAME[-1] ^ 1]), NAME + b"\0", META, b"", frame(b"\x05\x01\x41")])
+@pytest.mark.parametrize(
+    "teds",
+    [
+        NAME[:-1] + bytes([NAME[-1] ^ 1]),
+        NAME + b"\0",
+        META,
+        b"",
+        frame(b"\x05\x01\x41"),
+        frame(bytes.fromhex("0304000c01")),  # a TEDSID that is cut off
+        frame(bytes.fromhex("030600000c010101")),  # one of neither edition
+        frame(bytes.fromhex("0404000c0101")),
+    ],
+)
 def test_update_checks_length_checksum_and_class(desk: Desk, teds: bytes) -> None:
     desk.stage((1, 12), teds)
     assert desk.sealed(update_teds(1, 12)) == refusal(Reason.BAD_FORM)
@@ -375,6 +387,24 @@ def test_every_refusal_of_the_commit(desk: Desk) -> None:
     assert desk.commit(BLOCKS, desk.signed(BLOCKS, sequence=65536)).ok
 
 
+def test_a_node_takes_canonical_datasheets_up_to_their_edges_and_no_others(desk: Desk) -> None:
+    listed = security.decode(desk.signed(BLOCKS)).signed_blocks
+    ours = security.OUR_VALUES
+    for wrong in (
+        resigned(desk, ca="x" * 65),
+        resigned(desk, signed_blocks={**listed, (0, 128): bytes(32)}),
+        resigned(desk, last_modified=bytes(7)),
+        resigned(desk, extra={99: b"x"}),
+        resigned(desk, values={number: value for number, value in ours.items() if number != 110}),
+        *(resigned(desk, values={**ours, number: value + 1}) for number, value in ours.items()),
+    ):
+        assert desk.commit(BLOCKS, wrong) == refusal(Reason.BAD_FORM)
+    beside = {**BLOCKS, (3, 128): frame(bytes.fromhex("030400800101"))}
+    listed |= {(3, 128): digest(beside[3, 128])}
+    good = resigned(desk, ca="\u00e9" * 32, signed_blocks=listed, extra={111: b"", 255: b"y"})
+    assert desk.commit(beside, good).ok, "64 octets of a name, a TEDS of code 128 on another channel"
+
+
 def test_of_two_faults_of_a_commit_the_first_check_names_its_own(desk: Desk) -> None:
     foreign = frame(bytes.fromhex("030400010101040a") + bytes(10) + bytes.fromhex("0a043f8000000c043f0000000d020001"))
     of_another = {(0, 1): foreign, (1, 12): NAME}
@@ -436,6 +466,34 @@ def test_no_extra_field_comes_twice_or_behind_a_later_one(desk: Desk) -> None:
         changed = body.replace(b"\x71\x04ours", bytes([field, 4]) + b"ours")
         assert changed != body
         assert desk.commit(BLOCKS, frame(changed)) == refusal(Reason.BAD_FORM)
+
+
+def test_no_block_is_listed_twice_or_behind_a_later_one(desk: Desk) -> None:
+    body = unframe(desk.signed(BLOCKS))
+    at = body.index(b"\x6c\x23\0\0\1")
+    first, second = body[at : at + 37], body[at + 37 : at + 74]
+    assert second[:5] == b"\x6c\x23\0\1\x0c"
+    for wrong in (first + first + second, first + second + second, second + first, first + second[:-1]):
+        changed = body[:at] + wrong + body[at + 74 :]
+        assert desk.commit(BLOCKS, frame(changed)) == refusal(Reason.BAD_FORM)
+
+
+@pytest.mark.parametrize("field", [100, 101, 102, 103, 104])
+def test_spare_bits_and_padding_of_base64_are_as_they_must_be(desk: Desk, field: int) -> None:
+    body = unframe(desk.signed(BLOCKS))
+    at = body.index(bytes([field, 88])) + 2
+    text = body[at : at + 88]
+    ends = text.index(b"=")
+    assert ends == (87 if field in (101, 103) else 86)
+    last = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/".index(text[ends - 1])
+    spare = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"[last + 1 : last + 2]
+    for wrong in (
+        text[: ends - 1] + spare + text[ends:],
+        text[:ends] + b"A" + text[ends + 1 :],
+        text[: ends - 1] + b"-" + text[ends:],
+        text[:40] + b"=" + text[41:],
+    ):
+        assert desk.commit(BLOCKS, frame(body[:at] + wrong + body[at + 88 :])) == refusal(Reason.BAD_FORM), wrong
 
 
 def test_extra_fields_are_covered_by_the_signature(desk: Desk) -> None:

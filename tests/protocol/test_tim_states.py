@@ -402,6 +402,16 @@ def test_confirm_and_reset_end_every_session_on_every_link() -> None:
     assert desk.plain(other.seal(COMMANDS["identify"]), link="can:f1") == refusal(Reason.WRONG_STATE)
 
 
+def test_a_half_open_open_goes_with_its_link_alone() -> None:
+    desk = Desk().agree()
+    half_open = {link: desk.open(link=link).session for link in ("nfc", "can:f1")}
+    desk.tim.link_lost("nfc")
+    for link, reason in (("nfc", Reason.WRONG_STATE), ("can:f1", None)):
+        session = half_open[link]
+        assert session is not None
+        assert desk.plain(session.seal(COMMANDS["identify"]), link=link, tapped=False).reason == reason
+
+
 def test_confirm_ends_every_half_open_open_too() -> None:
     desk = Desk().agree().open(link="can:f2")
     half_open = desk.session
