@@ -397,8 +397,8 @@ class WhitelistPlan:
     unchanged: int
 
 
-def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPlan:
-    """Check entries against the store; changes nothing.
+def plan_addition(station: Station, listed: Sequence[ListedNode], *, rename: bool = False) -> WhitelistPlan:
+    """Check entries against the store; changes nothing. With ``rename`` their names replace those that are known.
 
     Raises KeyMismatchError if a UUID is pinned to another key, PolicyError for a revoked node: then none may be added.
     """
@@ -423,6 +423,8 @@ def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPl
             # lists and exports show the node's own name where the entry has none: such a name changes nothing
             is_own_name = known is not None and node is not None and entry.name == node.name
             wanted = _merged(known, replace(entry, name=None) if is_own_name else entry)
+            if rename and entry.name is not None and wanted.name is not None:
+                wanted = replace(wanted, name=entry.name)
             if wanted != known:
                 write.append(wanted)
                 new += known is None

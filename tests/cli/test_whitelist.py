@@ -31,6 +31,31 @@ def test_adding_again_is_nothing_to_do_and_another_key_is_refused(home: Path) ->
     assert f"whitelist remove {ONE}" in other.json["error"]["hint"]
 
 
+def test_a_name_that_is_given_is_written_and_one_in_a_file_replaces_none(home: Path, tmp_path: Path) -> None:
+    """`add` ended with "nothing to do" here, and the old name stayed."""
+    call(home, "whitelist", "add", ONE, "--name", "finger")
+    for name, changed in (("thumb", 1), ("thumb", 0)):
+        for dry in (["--dry-run"], []):
+            given = call(home, "--json", "whitelist", "add", ONE, "--name", name, *dry).json
+            assert (given["added"], given["changed"], given["unchanged"]) == (0, changed, 1 - changed), (name, dry)
+    (entry,) = call(home, "--json", "whitelist", "list").json["whitelist"]
+    assert (entry["name"], entry["fingerprint"], entry["assurance"]) == ("thumb", None, "uuid")
+    (tmp_path / "list.csv").write_text(f"uuid,fingerprint,name\n{ONE},{KEY},palm\n")
+    taken = call(home, "--json", "whitelist", "import", tmp_path / "list.csv").json
+    assert [(entry["name"], entry["fingerprint"]) for entry in taken["whitelist"]] == [("thumb", KEY)]
+    assert call(home, "--json", "whitelist", "add", ONE).json["unchanged"] == 1
+
+
+def test_the_nodes_own_name_is_not_written_twice(home: Path) -> None:
+    call(home, "whitelist", "add", ONE)
+    with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as station, station.transaction():
+        station.nodes.remember(bytes.fromhex(ONE), name="thumb")
+    assert call(home, "--json", "whitelist", "add", ONE, "--name", "thumb").json["unchanged"] == 1
+    assert call(home, "--json", "whitelist", "add", ONE, "--name", "palm").json["changed"] == 1
+    again = call(home, "--json", "whitelist", "add", ONE, "--name", "thumb").json
+    assert (again["changed"], again["whitelist"][0]["name"]) == (1, "thumb")
+
+
 def test_removing_asks_and_then_another_key_may_come(home: Path) -> None:
     call(home, "whitelist", "add", ONE, "--fingerprint", KEY)
     assert call(home, "whitelist", "remove", ONE).code == 6

@@ -60,13 +60,13 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
         fingerprint = scanned[1]
     provisioning.whitelist.require_name(name)
     wanted = provisioning.whitelist.ListedNode(0, octets, fingerprint, name)
-    plan = provisioning.whitelist.plan_addition(station, [wanted])
+    plan = provisioning.whitelist.plan_addition(station, [wanted], rename=True)
     if dry_run or not plan.write:
         _emit_plan(app, station, plan, dry_run=dry_run)
         return
     station.unlock()
     with station.lock("whitelist add", app.note):
-        plan = provisioning.whitelist.plan_addition(station, [wanted])
+        plan = provisioning.whitelist.plan_addition(station, [wanted], rename=True)
         provisioning.whitelist.add(station, plan)
     _emit_plan(app, station, plan, dry_run=False)
 
