@@ -100,10 +100,41 @@ def test_channels_that_do_not_lie_side_by_side_come_into_their_columns() -> None
     np.testing.assert_allclose(got.age[2], [0.01, 0.02, 0.01, 0.02], atol=1e-6)
 
 
+def test_a_row_before_the_first_value_of_a_stream_has_none_of_it() -> None:
+    """Not even one that came later and is younger than two periods: no value is from the future."""
+    grid = Grid("g", [ANGLE, FORCE], patience=0.0)
+    grid.add_block(block([[1], [2], [3], [4]]))
+    grid.add_block(block([[70], [80]], uuid=HAND, channels=(2,), start=NOW + 0.015))
+    got = rows(grid, NOW + 0.0301)
+    np.testing.assert_allclose(got.value[:, 0], [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(got.value[:, 1], [np.nan, np.nan, 7.0, 8.0])
+    np.testing.assert_allclose(got.age[:, 1], [np.nan, np.nan, 0.005, 0.005], atol=1e-6)
+
+
+def test_rows_are_marked_from_the_first_test_pattern_on() -> None:
+    grid = Grid("g", [ANGLE, FORCE], patience=0.0)
+    grid.add_block(block([[1]]))
+    assert not rows(grid, NOW + 0.001).test_pattern
+    grid.add_block(block([[1]], uuid=HAND, channels=(2,), test_pattern=True))
+    grid.add_block(block([[2]], index=1))
+    assert rows(grid, NOW + 0.011).test_pattern, "whichever of its channels it is"
+
+
+def test_after_a_long_gap_the_last_ten_thousand_rows_come() -> None:
+    grid = Grid("g", [ANGLE], patience=0.0)
+    grid.add_block(block([[1]]))
+    rows(grid, NOW)
+    grid.add_block(block([[2]], start=NOW + 200.0))
+    got = rows(grid, NOW + 200.001)
+    assert len(got.time) == 10_000
+    np.testing.assert_allclose(got.time[[0, -1]] - NOW, [100.01, 200.0], atol=1e-6)
+
+
 def test_how_far_apart_streams_began_is_reported() -> None:
     grid = Grid("g", [ANGLE, FORCE])
     grid.add_block(block([[1]]))
     grid.add_block(block([[1]], uuid=HAND, channels=(2,), start=NOW + 0.004))
+    grid.add_block(block([[1]], index=5))
     np.testing.assert_allclose(grid.began_apart(), 0.004, atol=1e-6)
 
 

@@ -49,6 +49,7 @@ def test_more_than_four_streams_are_put_together_at_the_slowest_period_and_event
     assert together == [((1, 2, 3, 4, 5), 2.5)], "what is asked of a sensor is never more than it can"
     events = channels(1.0, first=6, kind=ChannelKind.EVENT_SENSOR)
     assert planned([*channels(0.1, 0.2, 0.05, 0.4), *events]) == [((1, 2, 3, 4), 2.5), ((6,), 1.0)]
+    assert planned(channels(1.0, 1.0, first=6, kind=ChannelKind.EVENT_SENSOR)) == [((6,), 1.0), ((7,), 1.0)], "n = 1"
     with pytest.raises(PolicyError, match="70 channels need 5 streams; a node has 4"):
         planned(channels(*[0.1] * 70))
 
@@ -117,7 +118,9 @@ def test_the_sensors_that_are_measured_are_those_that_were_asked_for_in_their_or
     assert [channel.number for channel in sensors_of(every, (3, 1, 3), None)] == [3, 1]
     assert [channel.number for channel in sensors_of(every, (), StreamKind.EVENT)] == [3]
     assert [channel.number for channel in sensors_of(every, (), StreamKind.FREE)] == [1, 2]
-    for wanted, kind in (((4,), None), ((3,), StreamKind.PERIODIC), ((9,), None)):
+    every.append(Channel(5, kind=ChannelKind.SENSOR, timing=Timing(period=0.1)))
+    assert [channel.number for channel in sensors_of(every, (), None)] == [1, 2, 3], "5 has no form of a sample"
+    for wanted, kind in (((4,), None), ((5,), None), ((3,), StreamKind.PERIODIC), ((9,), None)):
         with pytest.raises(BadDataError, match="is not a sensor that can be measured this way"):
             sensors_of(every, wanted, kind)
     with pytest.raises(BadDataError, match="no sensor"):
@@ -140,7 +143,9 @@ def test_frames_of_a_node_are_spread_over_half_of_its_own_time_but_two_milliseco
 def test_a_plan_says_by_how_much_it_was_slowed_and_a_part_of_a_millionth_is_nothing() -> None:
     assert plan_node(channels(0.01), BUS, slower=1.0000005).slowed == ""
     assert plan_node(channels(0.01), BUS, slower=1.000002).slowed.startswith("slowed from 100 Hz to 99.9998 Hz")
-    assert plan_node(channels(0.01, 0.1), BUS, slower=2.0).periods() == {1: 0.02, 2: 0.2}
+    both = plan_node(channels(0.1, 0.01), BUS, slower=2.0)
+    assert both.periods() == {1: 0.2, 2: 0.02}
+    assert both.slowed == "slowed from 100 Hz to 50 Hz: the node allows no shorter period", "of the quickest channel"
 
 
 def test_a_message_holds_a_sample_at_least_and_a_sample_that_fits_none_is_refused() -> None:
