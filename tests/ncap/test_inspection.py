@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NotAuthenticError, PolicyError
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.measure import verified_session
 from teds_provision.measure.verified_session import open_unverified
 from teds_provision.ncap.nodes import inspection
@@ -90,3 +90,52 @@ def test_an_unsigned_datasheet_counts_only_as_it_was_read_since_the_start_of_the
         return
     assert open_unverified(none, node, by="ncap").unverified
     assert sheets == [now if kept else before]
+
+
+def strangers_reading(
+    monkeypatch: pytest.MonkeyPatch, listed: list[tuple[int, int]], octets: int
+) -> tuple[dict[tuple[int, int], float | None], dict[tuple[int, int], bytes]]:
+    """Inspect a stranger with these TEDS of so many octets each; return what was read until when, and what is shown."""
+    read: dict[tuple[int, int], float | None] = {}
+    shown: dict[tuple[int, int], bytes] = {}
+
+    def read_block(_node: Any, block: tuple[int, int], *, until: float | None = None) -> bytes:
+        read[block] = until
+        return bytes(octets)
+
+    def from_image(image: Image) -> None:
+        shown.update(image.blocks)
+
+    monkeypatch.setattr(inspection, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    monkeypatch.setattr(inspection, "list_blocks", lambda _node: listed)
+    monkeypatch.setattr(inspection, "read_block", read_block)
+    monkeypatch.setattr(inspection, "is_keyed", lambda *_words: False)
+    monkeypatch.setattr(inspection, "read_firmware", lambda _node, *, once: None)
+    monkeypatch.setattr(inspection, "firmware_of", lambda *_words: None)
+    monkeypatch.setattr(inspection, "freshness_floor_of", lambda *_words: None)
+    monkeypatch.setattr(inspection, "verify_image", lambda *_words, floor: ())
+    monkeypatch.setattr(inspection, "Sheet", SimpleNamespace(from_image=from_image))
+    nobody: Any = None
+    node: Any = SimpleNamespace(uuid=bytes(10))
+    who: Any = SimpleNamespace(security_teds=b"read before")
+    found = inspection._stranger(nobody, node, who)
+    assert (found.judged.origin, found.power) == ("plain", None)
+    return read, shown
+
+
+def test_of_a_stranger_256_teds_are_read_within_a_minute_and_its_security_teds_not_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    listed = [SECURITY, *((channel, 3) for channel in range(1, 256)), (1, 5), (2, 5)]
+    read, shown = strangers_reading(monkeypatch, listed, 12)
+    assert list(read) == listed[1:256]
+    assert set(read.values()) == {1060.0}
+    assert set(shown) == set(listed[:256])
+    assert shown[SECURITY] == b"read before"
+
+
+def test_a_strangers_teds_of_more_than_65535_octets_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, shown = strangers_reading(monkeypatch, [(1, 3)], 65_535)
+    assert len(shown[1, 3]) == 65_535
+    with pytest.raises(BadDataError, match="TEDS 3 of channel 1 has 65536 octets: too long"):
+        strangers_reading(monkeypatch, [(1, 3)], 65_536)
