@@ -88,3 +88,42 @@ def test_random_octets_are_not_plausible(digits: str) -> None:
 def test_parts_that_do_not_fit_are_named(part: str, value: int) -> None:
     with pytest.raises(BadDataError, match=part):
         teds.pack_uuid(replace(parts_of("8D4D9DA65281F7000000"), **{part: value}))
+
+
+@pytest.mark.parametrize(
+    ("changed", "plausible"),
+    [
+        ({"latitude": 90 * 3600}, True),
+        ({"latitude": 90 * 3600 + 1}, False),
+        ({"longitude": 180 * 3600}, True),
+        ({"longitude": 180 * 3600 + 1}, False),
+        ({"year": 1989}, False),
+        ({"year": 1990}, True),
+        ({"year": 2199}, True),
+        ({"year": 2200}, False),
+        ({"year": 2026, "time": 3_153_599}, True),
+        ({"year": 2026, "time": 3_153_600}, False),
+        ({"year": 2024, "time": 3_162_239}, True),
+    ],
+)
+def test_a_place_on_earth_and_a_moment_of_its_year_are_plausible(changed: dict[str, int], plausible: bool) -> None:
+    assert replace(parts_of("8D4D9DA65281F7000000"), **changed).plausible == plausible
+
+
+def test_the_parts_stand_at_their_bits() -> None:
+    """North 1, latitude 20, east 1, longitude 20, manufacturer 4, year 12, time 22, the most significant bit first."""
+    widths = {"north": 1, "latitude": 20, "east": 1, "longitude": 20, "manufacturer": 4, "year": 12, "time": 22}
+    none = dict.fromkeys(widths, 0)
+    at = 80
+    for part, width in widths.items():
+        full = {**none, part: (1 << width) - 1}
+        at -= width
+        octets = (full[part] << at).to_bytes(10, "big")
+        parts = teds.unpack_uuid(octets)
+        assert parts is not None
+        assert {name: int(getattr(parts, name)) for name in widths} == full
+        assert teds.pack_uuid(parts) == octets
+        if width > 1:
+            with pytest.raises(BadDataError, match=f"The {part} of a 2007 UUID has {width} bits"):
+                teds.pack_uuid(replace(parts, **{part: 1 << width}))
+    assert at == 0
