@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -514,3 +515,67 @@ def test_a_set_point_of_a_topic_passes_if_the_measurement_and_its_owner_let_it(
         job._commands = lambda command: came.append(command.value)
         first(SetPointCommand(UUID.hex(), 1, 0.5, 0.0))
     assert came == (passed or [])
+
+
+def test_a_session_goes_from_the_clock_to_the_claim_to_the_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """operation.md section 7: Clock, Operate, Subscribe; sinks know a channel before its first value."""
+    supervisor, done = supervisor_at([0.0], monkeypatch), list[str]()
+
+    def does(name: str) -> Any:
+        return lambda *_words, **_more: done.append(name)
+
+    monkeypatch.setattr(
+        supervisor,
+        "streams",
+        SimpleNamespace(new_session=does("new"), tell_time=does("clock"), described=does("described"), running={}),
+    )
+    monkeypatch.setattr(supervisor, "_actuators", lambda _trusted: [])
+    monkeypatch.setattr(supervisor, "_sensors", lambda _every, _actuators: [SimpleNamespace(number=1)])
+    monkeypatch.setattr(supervisor, "_claim", does("operate"))
+    monkeypatch.setattr(supervisor, "_set_state", does("running"))
+    monkeypatch.setattr(supervisor, "_events", SimpleNamespace(facts=does("facts")))
+
+    def subscribe(*_words: Any) -> Any:
+        done.append("subscribe")
+        return SimpleNamespace(periods=dict, slowed="")
+
+    monkeypatch.setattr(supervisor, "_subscribe", subscribe)
+    trusted: Any = SimpleNamespace(sheet=SimpleNamespace(channels=()), facts=lambda _channel, _period: None)
+    none: Any = None
+    supervisor.ready.clear()
+    supervisor._measure(none, trusted, 0x21)
+    assert done == ["new", *["clock"] * 5, "operate", "subscribe", "facts", "described", "running"]
+    assert (supervisor.ever_ran, supervisor.ready.is_set()) == (True, True)
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_session_ends_with_actuators_then_streams_then_idle_as_far_as_the_node_answers(
+    answers: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    supervisor, done = supervisor_at([0.0], monkeypatch), list[Any]()
+    node = SimpleNamespace(
+        request=lambda command, _doing: done.append((command.channel, command.command_class, command.function)),
+        forget=lambda: done.append("forget"),
+    )
+    trusted: Any = SimpleNamespace(node=node)
+    share = SimpleNamespace(lock=threading.Lock(), taken={UUID: 0.3, b"other": 0.1})
+    bus: Any = SimpleNamespace(share=share)
+    supervisor._driven = cast(Any, SimpleNamespace(close=lambda: done.append("actuators")))
+    supervisor.verified = trusted
+    monkeypatch.setattr(
+        supervisor, "_buses", SimpleNamespace(presence=SimpleNamespace(let_announce=lambda _uuid: done.append("let")))
+    )
+    monkeypatch.setattr(
+        supervisor,
+        "streams",
+        SimpleNamespace(stop=lambda _bus, session, address: done.append(("stop", session is trusted, address))),
+    )
+    supervisor._end(bus, trusted, 0x21, answers=answers)
+    last = (0, 4, 2) if answers else "forget"
+    assert done == ["actuators", "let", ("stop", answers, 0x21), last]
+    assert share.taken == {b"other": 0.1}, "its room on the bus is free"
+    assert (supervisor._driven, supervisor.verified) == (None, None)
+    supervisor._comes_back = True
+    share.taken[UUID] = 0.3
+    supervisor._end(bus, trusted, 0x21, answers=answers)
+    assert share.taken == {UUID: 0.3, b"other": 0.1}, "it keeps its room while it is lent"
