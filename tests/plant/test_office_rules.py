@@ -1,0 +1,256 @@
+"""In which order an office looks at a request, and at which edge it says no (contract/plant.md section 11)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from teds_provision.errors import BadDataError, PolicyError
+from teds_provision.plant import office
+from teds_provision.plant.jobs import take_job
+from teds_provision.plant.office import RequestAheadError, _RefusedError, _require_name, _text_of
+from teds_provision.plant.sign_requests import name_of, receivers
+from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.protocol.plant.job import Job
+from teds_provision.protocol.plant.signing import SignRequest, open_request, seal_request
+from teds_provision.station.plant.line import UnitRow
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
+from tests.bench import Board
+
+from .owner import job_of
+from .stations import Plant
+from .test_jobs import make_board
+from .test_office import Desk, LocalOffice, proven
+
+UUID = bytes.fromhex("8d4d9da65281f7000001")
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    plant = Plant(tmp_path)
+    line = plant.member("west", "line")
+    plant.north.unlock()
+    line.unlock()
+    yield Desk(plant, plant.north, line, LocalOffice(plant.north))
+    plant.close()
+
+
+def test_a_request_is_judged_in_the_order_of_the_contract(desk: Desk) -> None:
+    """One that is wrong in every way, which is put right one thing after the other."""
+    board, base = make_board(1), desk.plant.member("south", "base")
+    good = desk.request(desk.run(count=1, stations={desk.line.fingerprint: 1}), board)
+    north, line = desk.office, desk.office.plant.line
+    named = replace(good, name="another name", nonce=bytes(16), sequence=70_000)
+    bad = replace(named, key_signature=bytes(64), proof=bytes(64))
+    north.policy.deny(RevocationRecord(board.uuid, None, "stolen", ""))
+    north.pins.put(WhitelistEntry(board.uuid, "ab" * 32, assurance="uuid"))
+    with north.transaction():
+        line.put_unit(UnitRow(good.job, bytes(10), 1, "2026-01-31T12:00:00Z"))
+
+    def refused(request: SignRequest, **more: Any) -> tuple[str, str]:
+        reply = desk.asks(request, **more)
+        assert reply.security == b""
+        return reply.refused, reply.why
+
+    assert refused(bad, by=base)[0] == "not-line"
+    assert refused(bad, jobs=[])[0] == "job"
+    assert refused(bad) == ("revoked", "the node was revoked: stolen")
+    north.policy.forgive(board.uuid)
+    assert refused(bad) == ("other-key", "this office knows the board with another key")
+    north.pins.remove(board.uuid)
+    assert refused(bad) == ("proof", "field 102 does not sign this key for this UUID")
+    assert refused(replace(named, proof=bytes(64))) == ("proof", "the board did not sign this request")
+    asked = proven(named, desk.line, board)
+    assert refused(asked) == ("full", "all 1 units of the job are assigned")
+    line._store.execute("DELETE FROM units")
+    assert refused(asked)[0] == "sequence"
+    assert refused(asked, jump=True)[0] == "differs"
+    assert north.pins.entry(board.uuid) is None, "nothing was kept"
+    assert line.units(good.job) == []
+    reply = desk.asks(proven(replace(good, nonce=bytes(16)), desk.line, board))
+    assert (reply.refused, reply.sequence) == ("", 1)
+
+
+def test_a_signature_is_durable_with_its_pin_unit_sequence_and_event(desk: Desk) -> None:
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+    reply = desk.asks(request)
+    north = desk.office
+    entry, node = north.pins.entry(board.uuid), north.nodes.get(board.uuid)
+    assert entry is not None
+    assert node is not None
+    assert (entry.assurance, node.point, node.sequence) == ("uuid", board.key.point, 1)
+    [row] = north.plant.line.units(request.job)
+    assert (row.uuid, row.unit, row.attempts, row.passed) == (board.uuid, 1, 1, 0)
+    kept = north.plant.line.sign_request(request.hash, "in")
+    assert kept is not None
+    assert (kept.peer, kept.job, kept.sequence, kept.request) == (
+        desk.line.fingerprint, request.job, 1, request.octets
+    )  # fmt: skip
+    told = [json.loads(text) for _, _, text in north.plant.outbox(99)]
+    [signed] = [one for one in told if one["act"] == "signed"]
+    assert (signed["uuid"], signed["sequence"], signed["job"], signed["unit"]) == (
+        board.uuid.hex(), 1, request.job, 1
+    )  # fmt: skip
+    assert reply.sequence == 1
+
+
+@pytest.mark.parametrize(
+    ("own", "asked", "sequence"),
+    [(0, 0, 1), (9, 3, 10), (3, 9, 10), (9, 9, 10), (4, 65_539, 65_540), (4, 65_540, None), (0, 65_535, 65_536)],
+)
+def test_a_sequence_is_one_more_than_the_greater_and_jumps_at_most_65535(
+    desk: Desk, own: int, asked: int, sequence: int | None
+) -> None:
+    board = make_board(1)
+    request = proven(desk.request(desk.run(), board), desk.line, board, sequence=asked)
+    desk.office.nodes.remember(board.uuid, sequence=own)
+    reply = desk.asks(request)
+    if sequence is None:
+        assert (reply.refused, desk.office.plant.line.units(request.job)) == ("sequence", [])
+        reply = desk.asks(request, jump=True)
+        sequence = asked + 1
+    assert (reply.refused, reply.sequence) == ("", sequence)
+
+
+def test_a_request_of_more_than_a_day_ahead_gets_no_answer_yet(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    request = desk.request(desk.run(), make_board(1))
+    for ahead, waits in ((timedelta(hours=24), False), (timedelta(hours=24, seconds=1), True)):
+        monkeypatch.setattr(office, "now_of", lambda roster, ahead=ahead: request.created - ahead)
+        if waits:
+            with pytest.raises(RequestAheadError, match="west dated this request"):
+                desk.asks(request)
+            continue
+        assert desk.asks(request).security
+
+
+def test_a_job_that_names_another_office_or_lists_another_board_or_key_signs_nothing(desk: Desk) -> None:
+    board = make_board(1)
+    good = desk.request(desk.run(), board)
+    key = desk.office.pins
+
+    def refused(**changes: Any) -> tuple[str, str]:
+        named = {"stations": {desk.line.fingerprint: 3}, "sign": desk.office.fingerprint, **changes}
+        made = take_job(desk.office, job_of(desk.office, registry=desk.plant.roster.registry, **named))
+        reply = desk.asks(proven(replace(good, job=made.id), desk.line, board))
+        return reply.refused, reply.why
+
+    assert refused(sign="5c" * 32) == ("job", "the job names another office")
+    assert refused(sign="station") == ("job", "the job names another office")
+    assert refused(count=None, boards={bytes(10): "ab" * 32}) == ("job", "the board is not on the job's list")
+    listed = refused(count=None, boards={board.uuid: "ab" * 32})
+    assert listed == ("other-key", "the job lists the board with another key")
+    assert refused(stations={desk.office.fingerprint: 3})[0] == "job", "the line has no part in it"
+    assert refused() == ("", "")
+    assert key.entry(board.uuid) is not None
+
+
+def test_who_may_not_sign_is_no_office_and_what_is_for_another_gets_no_answer(desk: Desk) -> None:
+    request = desk.request(desk.run(), make_board(1))
+    with pytest.raises(PolicyError, match="does not have the role 'sign'"):
+        office.answer(desk.line, request.octets)
+    desk.line.unlock()
+    elsewhere = seal_request(replace(request, to="0" * 64), desk.line.credentials().key)
+    assert office.answer(desk.office, elsewhere) is None
+    assert office.answer(desk.office, request.octets[:-8]) is None
+    desk.office.plant.begin_restored()
+    with pytest.raises(PolicyError, match="restored from a backup"):
+        office.answer(desk.office, request.octets)
+
+
+# -- names, files, ids -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pattern", "name", "good"),
+    [
+        (None, "anything", True),
+        (None, None, True),
+        ("cell {unit:03}", "cell 037", True),
+        ("cell {unit:03}", "cell 37", True),  # a line counts as it likes
+        ("cell {unit}", "cell 4294967295", True),
+        ("cell {unit}", "cell 42949672950", False),
+        ("cell {unit}", "cell ", False),
+        ("cell {unit}", "cell x", False),
+        ("cell {unit}", "cell 1 ", False),
+        ("cell {unit}", None, False),
+        ("{uuid8}.", "8d4d9da6.", True),
+        ("{uuid8}.", "8d4d9da6x", False),
+        ("{uuid8}", "00000000", False),
+        ("{uuid}", "8d4d9da65281f7000001", True),
+        ("{uuid}", "8d4d9da65281f7000002", False),
+        ("{uuid8} {unit:05}", "8d4d9da6 00001", True),
+        ("[{unit}]", "[7]", True),
+        ("[{unit}]", "7", False),
+    ],
+)
+def test_a_board_is_named_by_the_pattern_of_its_job(pattern: str | None, name: str | None, good: bool) -> None:
+    made, request = SimpleNamespace(name=pattern), SimpleNamespace(uuid=UUID, name=name)
+    if good:
+        _require_name(cast("Job", made), cast("SignRequest", request))
+        return
+    with pytest.raises(_RefusedError) as error:
+        _require_name(cast("Job", made), cast("SignRequest", request))
+    assert error.value.word == "differs"
+
+
+@pytest.mark.parametrize(
+    ("octets", "kind"),
+    [
+        (b"\xef\xbb\xbf  <dcc/>", "certificate.xml"),
+        (b' {"a": 1}', "calibration.json"),
+        (b"[1]", "calibration.json"),
+        (b"raw, value\n0, 0\n", "calibration.csv"),
+        (b'date = "2026-01-31"\n', "calibration.toml"),
+    ],
+)
+def test_a_calibration_is_read_by_what_it_looks_like(octets: bytes, kind: str) -> None:
+    assert _text_of(octets) == (octets.decode("utf-8-sig"), kind)
+    with pytest.raises(BadDataError, match="not UTF-8"):
+        _text_of(octets + b"\xff")
+
+
+def test_a_parcel_of_a_document_has_an_id_made_from_its_h_and_a_job_goes_to_its_stations_and_office() -> None:
+    assert name_of("0123456789abcdef0123456789abcdef" + "f" * 32) == "01234567-89ab-4def-8123-456789abcdef"
+    me = cast("Station", SimpleNamespace(identity=SimpleNamespace(fingerprint="me")))
+
+    def to(office: str | None, *stations: str) -> list[str]:
+        return receivers(me, cast("Job", SimpleNamespace(stations=dict.fromkeys(stations, 1), office=office)))
+
+    assert to("office", "west", "me", "south") == ["west", "south", "office"]
+    assert to("west", "west", "me") == ["west"]
+    assert to("me", "west") == ["west"]
+    assert to(None, "me") == []
+
+
+def test_a_request_of_another_line_for_the_same_board_binds_its_own_key(desk: Desk) -> None:
+    """What a board signed for one line is of no use to another one."""
+    board = make_board(1)
+    request = desk.request(desk.run(stations={desk.line.fingerprint: 3}), board)
+    east = desk.plant.member("east", "line")
+    run = desk.run(stations={desk.line.fingerprint: 1, east.fingerprint: 1})
+    assert run.job is not None
+    moved = replace(request, job=run.job.id)
+    east.unlock()
+    stolen = desk.asks(moved, by=east)
+    assert (stolen.refused, stolen.why) == ("proof", "the board did not sign this request")
+    assert open_request(request.octets, lambda kid: desk.line.point).line == desk.line.point
+
+
+def test_another_board_that_shows_the_key_of_a_listed_one_has_no_field_102(desk: Desk) -> None:
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+    other = Board(uuid=make_board(2).uuid)
+    moved = replace(
+        request, image=replace(request.image, uuid=other.uuid),
+        key_signature=other.key.sign(node_key_message(other.uuid, SoftwareKey(9).point)),
+    )  # fmt: skip
+    assert desk.asks(proven(moved, desk.line, board)).why == "field 102 does not sign this key for this UUID"
