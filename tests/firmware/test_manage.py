@@ -6,16 +6,20 @@ import itertools
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import cast
 
 import pytest
 
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, security_command, write_teds
+from teds_provision.protocol.operation.commands import OperateCommand
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.firmware import smp
+from tests.firmware.bench import CBench
 from tests.firmware.desk import CDesk
 from tests.firmware.smp import packet
 from tests.protocol.desk import CREDENTIALS, NAME, UUID
+from tests.protocol.operation.bench import DIGEST
 
 pytestmark = pytest.mark.system
 
@@ -30,6 +34,7 @@ _FLASH, _IDENTITY, _FORM = -2, -4, -7
 def closed() -> Iterator[None]:
     yield
     CDesk.close_all()
+    CBench.close_all()
 
 
 @dataclass
@@ -175,6 +180,10 @@ def test_a_board_that_reports_nothing_knows_none_of_the_three() -> None:
     desk.keyed()
     for function in (ABOUT, LOCATE, MANAGE):
         assert desk.sealed(Command(0, 128, function, b"")).reason == Reason.UNKNOWN_COMMAND
+    for desk in (CDesk(), cast("CDesk", CDesk().agree())):
+        for command in (Command(0, 128, ABOUT), Command(0, 128, LOCATE, b"\1")):
+            for link in ("nfc", "can:f1"):
+                assert desk.plain(command, link=link, tapped=link == "nfc").reason == 1, "unknown in every state"
 
 
 def test_locate_blinks_for_its_time_and_a_new_request_replaces_it() -> None:
@@ -357,6 +366,9 @@ def test_numbers_may_be_longer_than_they_need_be() -> None:
         assert desk.manage(packet(smp.UPLOAD, body)).ok
     other = b"\xa3\x63off\x1b\0\0\0\0\0\0\0\0\x63sha\x41\x02\x63len\x01"
     assert desk.why(packet(smp.UPLOAD, other)) == Reason.BUSY
+    for far in (b"\x1b\0\0\0\1\0\0\0\0", b"\x1b\1\0\0\0\0\0\0\0"):
+        body = b"\xa3\x63off" + far + b"\x63sha\x41\x02\x63len\x01"
+        assert desk.manage(packet(smp.UPLOAD, body)).ok, "its lower 32 bits are 0, and it begins nothing"
 
 
 @pytest.mark.parametrize(
@@ -375,6 +387,9 @@ def test_numbers_may_be_longer_than_they_need_be() -> None:
         b"\x80",
         b"\xa1\x61d\x7f\x60\xff",
         b"\xba\x80\x00\x00\x00",  # so many pairs that twice their number is 0
+        b"\xa2\x61d\xc1\x61e\x01",  # a tag, or a text in pieces, that would stand for a value
+        b"\xa2\x61d\x7f\x61e\x01",
+        b"\xa2\x61d\x5f\x61e\x01",
     ],
 )
 def test_a_body_that_is_no_map_of_plain_values_is_refused(body: bytes) -> None:
@@ -410,7 +425,8 @@ def test_an_answer_that_is_none_gets_11() -> None:
 
 def test_a_restart_waits_until_its_reply_has_left() -> None:
     desk = Board.make().keyed()
-    assert desk.why(packet(smp.RESTART, b"\xa1\x65force\x01")) == Reason.BAD_FORM
+    for body in (b"\xa1\x65force\x01", b"\xa0\xa0", b"\xbf\xff", b"\x80"):
+        assert desk.why(packet(smp.RESTART, body)) == Reason.BAD_FORM
     reply = desk.sealed(Command(0, 128, MANAGE, packet(smp.RESTART)))
     assert reply.payload == packet((0x0B, 0, 5))
     assert desk.firmware.asked == []
@@ -434,6 +450,41 @@ def test_a_restart_comes_also_if_its_reply_is_never_taken() -> None:
 
 
 # -- when: claims, staging, uploads ------------------------------------------------------------------------------------
+
+
+def of_claims(firmware: Firmware) -> CBench:
+    """A board that measures; stations F1 and F2 have a session each."""
+    bench = CBench()
+    bench.tim.has_firmware(firmware)  # type: ignore[attr-defined]
+    bench.restart()
+    return cast("CBench", bench.open("can:f1").open("can:f2"))
+
+
+def test_while_anything_is_claimed_only_reads_and_echo_pass() -> None:
+    bench = of_claims(Firmware())
+    bench.operate(1)
+    changes = [packet(smp.RESTART), piece(0), packet(smp.SET_STATE, smp.start(OTHER))]
+    for link in ("can:f1", "can:f2"):
+        asked = [Command(0, 128, MANAGE, octets) for octets in changes]
+        assert [bench.reason(command, link) for command in asked] == [17, 17, 17], "its own claim counts too"
+        for octets in (packet(smp.PARAMETERS), packet(smp.STATES), packet(smp.ECHO)):
+            assert bench.reason(Command(0, 128, MANAGE, octets), link) is None
+        assert bench.reason(Command(0, 128, MANAGE, packet(smp.SET_STATE, smp.CONFIRM)), link) == 2
+    bench.idle(1)
+    assert bench.reason(Command(0, 128, MANAGE, changes[1]), "can:f2") is None
+
+
+def test_nobody_claims_anything_while_an_upload_lives() -> None:
+    firmware = Firmware(answer={"off": 40})
+    bench = of_claims(firmware)
+    assert bench.reason(Command(0, 128, MANAGE, piece(0)), "can:f2") is None
+    operate = OperateCommand(1, DIGEST, 60).command()
+    for link in ("can:f1", "can:f2"):
+        assert bench.reason(operate, link) == 17
+    firmware.answer = {"off": 1000}
+    assert bench.reason(Command(0, 128, MANAGE, piece(40)), "can:f2") is None
+    assert bench.reason(operate, "can:f1") != 17
+    bench.operate(1)
 
 
 def test_what_another_session_has_staged_keeps_changes_out_and_reads_not() -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from teds_provision.errors import BadDataError
 from teds_provision.protocol.messages import arguments
 from teds_provision.protocol.messages.arguments import size_of, words
+from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.messages.message import (
     compose_command,
     compose_service,
@@ -159,6 +160,29 @@ def test_identify_and_list_replies_of_the_profile():
         b"\x01\x00\x06\x00\x00\x01\x00\x01\x03", request=decode_message(compose_command(0, 128, 11))
     )
     assert listed.get("blocks") == ((0, 1), (1, 3))
+
+
+@pytest.mark.parametrize(
+    ("at", "octets", "good"),
+    [
+        (0, "01", True), (0, "00", False), (0, "02", False),  # the version of the profile
+        (11, "02", True), (11, "03", False),  # state
+        (20, "01ff", False), (20, "0200", True), (20, "0ffe", True), (20, "0fff", False),  # 512 to 4094
+        (22, "00", True), (22, "ef", True), (22, "f0", False),  # address: none, or up to 239
+    ],
+)  # fmt: skip
+def test_an_identity_lies_in_the_ranges_of_the_profile(at, octets, good):
+    payload = bytearray.fromhex("01" + "8d4d9da65281f7000000" + "01" + "00000002" + "00000003" + "0400" + "21")
+    payload[at : at + len(octets) // 2] = bytes.fromhex(octets)
+    assert len(payload) == 23
+    if good:
+        assert Identity.decode(bytes(payload)).encode() == payload
+    else:
+        with pytest.raises(BadDataError):
+            Identity.decode(bytes(payload))
+    for other in (payload[:-1], payload + b"\0"):
+        with pytest.raises(BadDataError):
+            Identity.decode(bytes(other))
 
 
 @pytest.mark.parametrize(
