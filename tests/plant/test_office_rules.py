@@ -103,6 +103,22 @@ def test_a_signature_is_durable_with_its_pin_unit_sequence_and_event(desk: Desk)
     assert reply.sequence == 1
 
 
+def test_the_same_request_gets_the_stored_answer_whatever_happened_since(desk: Desk) -> None:
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+    first = office.answer(desk.office, request.octets)
+    assert first is not None
+    north = desk.office
+    north.plant.line.set_job_state(request.job, "closed")
+    north.policy.deny(RevocationRecord(board.uuid, None, "stolen", ""))
+    north.plant.line._store.execute("DELETE FROM units")
+    assert office.answer(north, request.octets) == first
+    assert office.answer(north, request.octets, []) == first
+    assert north.plant.line.units(request.job) == [], "no new unit"
+    later = proven(replace(request, nonce=bytes(16)), desk.line, board)
+    assert desk.asks(later).refused == "job", "another H is another request"
+
+
 @pytest.mark.parametrize(
     ("own", "asked", "sequence"),
     [(0, 0, 1), (9, 3, 10), (3, 9, 10), (9, 9, 10), (4, 65_539, 65_540), (4, 65_540, None), (0, 65_535, 65_536)],
