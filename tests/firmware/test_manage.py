@@ -314,6 +314,12 @@ def test_nothing_else_than_the_list_passes() -> None:
         b"\xa1\x64hash\x59\x00\x20" + OTHER,
         b"\xa1\x64hash\x58\x20" + OTHER + b"\0",
         b"\xa1\x64hash\x58\x1f" + OTHER[:31],
+        b"\xa1\x44hash\x58\x20" + OTHER,  # a key of octets
+        b"\xa1\x64hash\x78\x20" + OTHER,
+        b"\xa1\x64hasH\x58\x20" + OTHER,
+        b"\xa3\x64hash\x58\x20" + OTHER + b"\x67confirm\xf4",
+        b"\xa1\x64hash\x58\x20" + OTHER + b"\x67confirm\xf4",
+        b"\xa2\x64hash\x58\x20" + OTHER,
         b"\xa0",
         b"",
     ],
@@ -371,10 +377,22 @@ def test_numbers_may_be_longer_than_they_need_be() -> None:
         assert desk.manage(packet(smp.UPLOAD, body)).ok, "its lower 32 bits are 0, and it begins nothing"
 
 
+def test_an_offset_beyond_32_bits_begins_no_upload() -> None:
+    """Else another image, whose start erases flash, would be taken for a later piece, or a later piece for a start."""
+    desk = Board.make().keyed()
+    desk.firmware.answer = {"off": 40}
+    assert desk.manage(piece(0)).ok
+    for off in (b"\x1b\0\0\0\1\0\0\0\0", b"\x1b\1\0\0\0\0\0\0\0"):
+        assert desk.manage(packet(smp.UPLOAD, b"\xa2\x63off" + off + b"\x63sha\x41\x02")).ok
+
+
 @pytest.mark.parametrize(
     "body",
     [
         b"\xa1\x61d\xc0\x60",
+        b"\xa1\xc0\x60",
+        b"\xa1\x61d\xd8\x20",
+        b"\xa1\xd8\x20\x60",
         b"\xa1\x61d\xfb" + bytes(8),
         b"\xa1\x61d\xf8\x20",
         b"\xa1\x61d",

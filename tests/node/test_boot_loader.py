@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from pathlib import Path
 
@@ -135,6 +136,44 @@ def test_an_image_that_was_uploaded_whole_can_be_uploaded_again(owner: Owner, fo
         assert manager._upload({"off": half, "data": octets[half:]}) == {"off": len(octets), "match": True}
 
 
+def test_what_the_other_slot_holds_is_looked_at_again_after_a_write_and_a_start(owner: Owner, folder: Path) -> None:
+    slots = started(folder)
+    assert slots.other is None
+    put(slots, owner.new)
+    assert slots.other is not None
+    assert slots.other.version_text == "1.1.0"
+    slots.start_next(owner.new.digest)
+    slots.start()
+    assert (slots.running.version_text, slots.other.version_text) == ("1.1.0", "1.0.0")
+    slots.start()
+    assert (slots.running.version_text, slots.other.version_text) == ("1.0.0", "1.1.0")
+
+
+def test_only_the_very_image_that_was_chosen_starts(owner: Owner, folder: Path) -> None:
+    slots = started(folder)
+    put(slots, owner.new)
+    slots.start_next(owner.new.digest)
+    other, _ = owner.image("1.2.0", counter=1)
+    put(slots, other)
+    assert state(started(folder)) == ("1.0.0", False, False)
+
+
+def test_an_image_is_on_the_disk_before_its_upload_is_called_whole(
+    owner: Owner, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    sync = os.fsync
+
+    def watched(descriptor: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{descriptor}").resolve().name)
+        sync(descriptor)
+
+    slots = started(folder)
+    monkeypatch.setattr(os, "fsync", watched)
+    put(slots, owner.new)
+    assert synced == ["slot-b.bin", "firmware"]
+
+
 def test_the_counter_does_not_fall_with_the_image_that_runs(owner: Owner, folder: Path) -> None:
     """Somebody put an older image into the slot that runs."""
     boot_loader._write_state(folder / boot_loader.FOLDER, boot_loader.BootState(counter=9))
@@ -178,7 +217,12 @@ def test_damaged_boot_state_is_named(folder: Path) -> None:
         whole.replace('"a"', '"c"'),
         whole.replace("false", "0"),
         whole.replace("/1", "/2"),
+        whole.replace('"counter": 1', '"counter": "1"'),
+        whole.replace("null", "7"),
+        whole.replace('"trial"', '"on_trial"'),
+        whole[:-1] + ', "more": 1}',
     ):
+        assert damaged != whole
         path.write_text(damaged)
         with pytest.raises(BadDataError, match="boot state"):
             ImageSlots(folder)

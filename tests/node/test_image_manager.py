@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import StoreError
 from teds_provision.firmware_image import FirmwareImage
 from teds_provision.node.firmware.boot_loader import ImageSlots
 from teds_provision.node.firmware.manager import ImageManager, ManagedFirmware
@@ -174,8 +175,8 @@ def test_another_image_begins_anew_and_one_without_a_digest_always(manager: Imag
     assert upload(manager, 0, IMAGE[:30], len=201, sha=SHA) == {"off": 30}
     assert upload(manager, 0, IMAGE[:20], len=200, sha=b"\5" * 32) == {"off": 20}
     assert upload(manager, 20, IMAGE[20:]) == {"off": 200, "match": False}
-    for _ in range(2):
-        assert upload(manager, 0, IMAGE[:10], len=200) == {"off": 10}
+    for octets in (30, 20, 10):
+        assert upload(manager, 0, IMAGE[:octets], len=200) == {"off": octets}
     assert upload(manager, 10, IMAGE[10:]) == {"off": 200, "match": True}, "nothing to hold it against"
     assert bytes(slots.written) == IMAGE
 
@@ -202,4 +203,15 @@ def test_a_slot_takes_a_mebibyte_and_a_full_disk_is_an_error(manager: ImageManag
     slots.broken = True
     assert upload(manager, 1, b"x") == {"err": {"group": 1, "rc": 12}}
     slots.broken = False
-    assert upload(manager, 1, b"x") == {"off": 2}
+    assert upload(manager, 1, b"y") == {"off": 2}
+    assert bytes(slots.written) == b"xy", "what was not written is written again"
+
+
+def test_state_that_cannot_be_stored_is_an_error_of_the_manager(
+    manager: ImageManager, slots: Slots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_digest: bytes) -> bool:
+        raise StoreError("The disk is full.")
+
+    monkeypatch.setattr(slots, "start_next", full)
+    assert ask(manager, 10, 1, 0, hash=NEW.digest) == {"err": {"group": 1, "rc": 12}}

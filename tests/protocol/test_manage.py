@@ -335,6 +335,17 @@ def test_an_upload_ends_when_it_is_complete_or_its_session_ends() -> None:
         assert reason == (Reason.BUSY if ends == "another session closed" else None)
 
 
+def test_the_length_of_an_upload_is_that_of_its_first_piece() -> None:
+    desk = ManagedDesk(answer={"off": 1})
+    assert desk.refuses(first(length=100)) is None
+    desk.manager.answer = {"off": 50}
+    assert desk.refuses(piece(1, bytes(49), len=50)) is None
+    assert desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").reason == Reason.BUSY
+    desk.manager.answer = {"off": 100}
+    assert desk.refuses(piece(50, bytes(50), len=2000)) is None
+    assert desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").ok
+
+
 def test_a_node_that_measures_claims_nothing_while_an_upload_lives() -> None:
     manager = Manager()
     bench = Bench(firmware=manager, manager=manager).open().open("can:f2")
@@ -349,7 +360,7 @@ def test_a_node_that_measures_claims_nothing_while_an_upload_lives() -> None:
 
 
 def test_a_refused_piece_begins_no_upload() -> None:
-    for failed in ({"rc": 8}, {"err": {"group": 1, "rc": 30}}):
+    for failed in ({"rc": 8}, {"err": {"group": 1, "rc": 30}}, {"rc": 0, "off": 1}):
         desk = ManagedDesk(answer=failed)
         assert desk.ask(first()).ok, "the manager's error is its reply"
         assert desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").ok
