@@ -207,6 +207,66 @@ def test_what_zephyr_needs_is_beside_each_board(name: str) -> None:
     assert ends[-1] <= 0x7E800, "there the board's storage_partition begins, which holds the identity key"
 
 
+_GOOD_BUILD = ("CONFIG_MCUMGR_GRP_IMG_TOO_LARGE_SYSBUILD=1", "CONFIG_UPDATEABLE_IMAGE_NUMBER=1", "HAS_WATCHDOG=1")
+_REFUSED_OF_MCUMGR = [
+    *(f"TRANSPORT_{name}" for name in ("BT", "UART", "UDP", "SHELL", "LORAWAN", "DUMMY")),
+    *(f"GRP_{name}" for name in ("FS", "SETTINGS", "STAT", "SHELL", "ZBASIC", "ENUM")),
+    "GRP_OS_RESET_BOOT_MODE",
+    "GRP_IMG_DIRECT_UPLOAD",
+    "GRP_IMG_ALLOW_CONFIRM_NON_ACTIVE_IMAGE_SECONDARY",
+    "GRP_IMG_ALLOW_CONFIRM_NON_ACTIVE_IMAGE_ANY",
+]
+
+
+def refusal_of(options: tuple[str, ...]) -> str:
+    """Return what the preprocessor refuses of a Zephyr build with updates and these options; "" if it is good."""
+    source = (builds.FIRMWARE / "port" / "zephyr" / "firmware.c").read_text()
+    _, found, checks = source.partition("/* One way in, which asks who it is. */")
+    assert found
+    checks = checks.partition("static struct {")[0]
+    words = [f"-D{option}" for option in ("DT_ALIAS(x)=0", "DT_NODE_HAS_STATUS(x,y)=HAS_WATCHDOG", *options)]
+    done = subprocess.run(["gcc", "-E", *words, "-xc", "-"], input=checks, capture_output=True, text=True, check=False)
+    return done.stderr if done.returncode else ""
+
+
+def test_a_zephyr_build_with_updates_has_one_way_in_one_image_and_a_watchdog() -> None:
+    builds.need("gcc")
+    assert refusal_of(_GOOD_BUILD) == ""
+    assert refusal_of(("CONFIG_MCUMGR_GRP_IMG_TOO_LARGE_BOOTLOADER_INFO=1", *_GOOD_BUILD[1:])) == ""
+    for name in _REFUSED_OF_MCUMGR:
+        assert "CONFIG_TEDS_MANAGE: " in refusal_of((*_GOOD_BUILD, f"CONFIG_MCUMGR_{name}=1")), name
+    for left_out, why in zip(
+        _GOOD_BUILD, ("TOO_LARGE_SYSBUILD=y", "one image", "an image on trial needs a watchdog"), strict=True
+    ):
+        assert why in refusal_of(tuple(option for option in _GOOD_BUILD if option != left_out))
+    assert "one image" in refusal_of((_GOOD_BUILD[0], "CONFIG_UPDATEABLE_IMAGE_NUMBER=2", _GOOD_BUILD[2]))
+
+
+def test_the_example_of_a_build_with_updates_is_one_that_is_taken() -> None:
+    """What is on by default is turned off in it by name."""
+    builds.need("gcc")
+    words = dict(re.findall(r"^(CONFIG_\w+)=(\S+)$", (builds.FIRMWARE / "boards" / "update.conf").read_text(), re.M))
+    assert words["CONFIG_MCUMGR_GRP_IMG_ALLOW_CONFIRM_NON_ACTIVE_IMAGE_SECONDARY"] == "n"
+    assert (words["CONFIG_BOOTLOADER_MCUBOOT"], words["CONFIG_TEDS_MANAGE"]) == ("y", "y")
+    options = [f"{name}={1 if value == 'y' else value}" for name, value in words.items() if value != "n"]
+    assert refusal_of((*options, *_GOOD_BUILD[1:])) == ""
+
+
+def test_kconfig_offers_updates_only_over_a_boot_loader_that_reverts() -> None:
+    kconfig = (builds.FIRMWARE / "zephyr" / "Kconfig").read_text()
+    option = kconfig.partition("config TEDS_MANAGE\n")[2].partition("\thelp\n")[0].replace("\\\n\t\t", "")
+    depends = [line.removeprefix("\tdepends on ") for line in option.splitlines() if line.startswith("\tdepends on ")]
+    assert depends == [
+        "BOOTLOADER_MCUBOOT",
+        "MCUBOOT_BOOTLOADER_MODE_SWAP_USING_MOVE || MCUBOOT_BOOTLOADER_MODE_SWAP_USING_OFFSET || "
+        "MCUBOOT_BOOTLOADER_MODE_SWAP_SCRATCH || MCUBOOT_BOOTLOADER_MODE_SWAP_WITHOUT_SCRATCH",
+        "ZEPHYR_ZCBOR_MODULE",
+    ]
+    for selected in ("IMG_ERASE_PROGRESSIVELY", "IMG_ENABLE_IMAGE_CHECK", "WATCHDOG", "REBOOT"):
+        assert f"\tselect {selected}\n" in option
+    assert "config TEDS_MANAGE_SECURITY_COUNTER\n" in kconfig
+
+
 def test_kconfig_takes_in_what_psa_is_asked_for() -> None:
     """What a build leaves out is refused at run time alone, and a signature that is none ends every agreement."""
     kconfig = (builds.FIRMWARE / "zephyr" / "Kconfig").read_text()

@@ -172,6 +172,12 @@ def test_what_a_board_lacks_is_not_offered(without: str, flags: int, shown: int)
     assert desk.why(b"") == (why or Reason.BAD_FORM)
 
 
+def test_what_a_board_says_of_bits_that_are_not_its_own_is_not_passed_on() -> None:
+    """Whether it locates and manages follows from its functions; bits 6 and 7 are 0."""
+    desk = Board.make(Firmware(0xFF & ~SIGNED), without="L")
+    assert desk.plain(Command(0, 128, ABOUT)).payload[1] == 0x2C
+
+
 def test_a_board_that_reports_nothing_knows_none_of_the_three() -> None:
     desk = Board.make(without="A")
     assert desk.plain(Command(0, 128, ABOUT, b"")).reason == Reason.UNKNOWN_COMMAND
@@ -377,15 +383,6 @@ def test_numbers_may_be_longer_than_they_need_be() -> None:
         assert desk.manage(packet(smp.UPLOAD, body)).ok, "its lower 32 bits are 0, and it begins nothing"
 
 
-def test_an_offset_beyond_32_bits_begins_no_upload() -> None:
-    """Else another image, whose start erases flash, would be taken for a later piece, or a later piece for a start."""
-    desk = Board.make().keyed()
-    desk.firmware.answer = {"off": 40}
-    assert desk.manage(piece(0)).ok
-    for off in (b"\x1b\0\0\0\1\0\0\0\0", b"\x1b\1\0\0\0\0\0\0\0"):
-        assert desk.manage(packet(smp.UPLOAD, b"\xa2\x63off" + off + b"\x63sha\x41\x02")).ok
-
-
 @pytest.mark.parametrize(
     "body",
     [
@@ -429,6 +426,9 @@ def test_an_answer_that_is_none_gets_11() -> None:
         good[:8],
         good[:-1],
         good + b"\0",
+        good[:1] + b"\1" + good[2:],
+        good[:3] + bytes([good[3] + 1]) + good[4:],
+        packet((smp.READ | 1, 0, 6), smp.encode({"x": bytes(971 - 8 - 6 + 1)})),  # one octet too long
         packet((smp.READ, 0, 6)),
         packet((smp.READ | 1, 1, 6)),
         packet((smp.READ | 1, 0, 6), sequence=8),
@@ -439,11 +439,14 @@ def test_an_answer_that_is_none_gets_11() -> None:
         assert desk.manage(packet(smp.PARAMETERS)).reason == Reason.FLASH_FAILURE
     desk.firmware.raw = good
     assert desk.manage(packet(smp.PARAMETERS)).payload == good
+    desk.firmware.raw = longest = packet((smp.READ | 1, 0, 6), smp.encode({"x": bytes(971 - 8 - 6)}))
+    assert len(longest) == 971
+    assert desk.manage(packet(smp.PARAMETERS)).payload == longest
 
 
 def test_a_restart_waits_until_its_reply_has_left() -> None:
     desk = Board.make().keyed()
-    for body in (b"\xa1\x65force\x01", b"\xa0\xa0", b"\xbf\xff", b"\x80"):
+    for body in (b"\xa1\x65force\x01", b"\xa0\xa0", b"\xbf\xff", b"\xa1", b"\x80"):
         assert desk.why(packet(smp.RESTART, body)) == Reason.BAD_FORM
     reply = desk.sealed(Command(0, 128, MANAGE, packet(smp.RESTART)))
     assert reply.payload == packet((0x0B, 0, 5))
@@ -499,6 +502,7 @@ def test_nobody_claims_anything_while_an_upload_lives() -> None:
     operate = OperateCommand(1, DIGEST, 60).command()
     for link in ("can:f1", "can:f2"):
         assert bench.reason(operate, link) == 17
+        assert bench.reason(Command(1, 4, 2), link) is None, "Idle claims nothing"
     firmware.answer = {"off": 1000}
     assert bench.reason(Command(0, 128, MANAGE, piece(40)), "can:f2") is None
     assert bench.reason(operate, "can:f1") != 17
@@ -559,6 +563,9 @@ def test_an_upload_ends_with_its_session() -> None:
     other = desk.beside()
     desk.firmware.answer = {"off": 40}
     assert desk.manage(piece(0)).ok
+    assert other.sealed(security_command(Function.CLOSE)).ok
+    assert desk.sealed(write_teds(1, 12, 0, NAME)).reason == Reason.BUSY, "that was the end of another session"
+    other = desk.beside()
     assert desk.sealed(security_command(Function.CLOSE)).ok
     assert other.manage(piece(0)).ok
     assert other.sealed(write_teds(1, 12, 0, NAME)).reason == Reason.BUSY

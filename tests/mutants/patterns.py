@@ -2750,6 +2750,42 @@ PATTERNS = (
         "app is None or not (app.home / SOCKET).exists()",
         "tests/cli/test_which_link.py",
     ),
+    # images of a board
+    Pattern(
+        "the length of an upload is that of its first piece",
+        "ManageFilter._upload_piece",
+        'piece.get("len") if piece["off"] == 0 else None',
+        'piece.get("len")',
+        "tests/protocol/test_manage.py",
+    ),
+    Pattern(
+        "an answer with rc 0 is one with rc",
+        "ManageFilter._upload_piece",
+        "any(key in answer for key in SMP_ERROR_KEYS)",
+        "any(answer.get(key) for key in SMP_ERROR_KEYS)",
+        "tests/protocol/test_manage.py",
+    ),
+    Pattern(
+        "only the very image that was chosen starts",
+        "ImageSlots._tried",
+        "image.digest.hex() != state.pending or (image.security_counter or 0) < state.counter",
+        "(image.security_counter or 0) < state.counter",
+        "tests/node/test_boot_loader.py",
+    ),
+    Pattern(
+        "an image is on the disk before its upload is whole",
+        "ImageSlots.flush",
+        "os.fsync(file.fileno())",
+        "None",
+        "tests/node/test_boot_loader.py",
+    ),
+    Pattern(
+        "an image without a digest is never carried on",
+        "ImageManager._upload",
+        "sha and (sha, length) == (self._sha, self._length)",
+        "(sha, length) == (self._sha, self._length)",
+        "tests/node/test_image_manager.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"
@@ -2974,5 +3010,40 @@ C_PATTERNS = (
         "taken->session->good_at = teds_now(node);",
         "taken->session->good_at += taken->session->good_at == 0 ? teds_now(node) : 0;",
         _IN_ONE_PROCESS,
+    ),
+    CPattern(
+        "no CBOR tag passes to the manager",
+        "manage.c",
+        "out->major == TAG || ",
+        "",
+        "tests/firmware/test_manage.py",
+    ),
+    CPattern(
+        "an offset of 2^32 is none of 0",
+        "manage.c",
+        "        out->value = more ? UINT32_MAX : out->value;\n",
+        "",
+        "tests/firmware/test_manage.py",
+    ),
+    CPattern(
+        "a claim of any session keeps an update out",
+        "manage.c",
+        "if (has_any_claim(node) || (node",
+        "if ((node",
+        "tests/firmware/test_manage.py",
+    ),
+    CPattern(
+        "nobody claims while an upload lives",
+        "manage.c",
+        " || (command->command_class == TEDS_CLASS_EITHER && function == 1)",
+        "",
+        "tests/firmware/test_manage.py",
+    ),
+    CPattern(
+        "the end of another session ends no upload",
+        "manage.c",
+        "if (node->managed.upload_of == session) {",
+        "(void)session; {",
+        "tests/firmware/test_manage.py",
     ),
 )
