@@ -119,6 +119,47 @@ def test_the_same_request_gets_the_stored_answer_whatever_happened_since(desk: D
     assert desk.asks(later).refused == "job", "another H is another request"
 
 
+def asked_for(desk: Desk, good: SignRequest, board: Board, **changes: Any) -> SignRequest:
+    """Return a good request for another job of the office, which is kept there alone."""
+    named = {"stations": {desk.line.fingerprint: 3}, "sign": desk.office.fingerprint, **changes}
+    made = take_job(desk.office, job_of(desk.office, registry=desk.plant.roster.registry, **named))
+    return proven(replace(good, job=made.id), desk.line, board)
+
+
+def test_a_name_that_the_job_does_not_give_is_signed_for_nobody(desk: Desk) -> None:
+    board = make_board(1)
+    request = asked_for(desk, desk.request(desk.run(), board), board, name="cell {unit}")
+    reply = desk.asks(request)
+    assert (reply.refused, reply.why) == ("differs", "the name None does not follow the job's pattern")
+
+
+def test_an_office_gives_the_unit_above_the_greatest(desk: Desk) -> None:
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+    line = desk.office.plant.line
+    with desk.office.transaction():
+        line.put_unit(UnitRow(request.job, bytes(10), 7, "2026-01-31T12:00:00Z"))
+    assert desk.asks(request).security
+    assert [row.unit for row in line.units(request.job)] == [7, 8]
+
+
+@pytest.mark.parametrize(
+    ("attempts", "builds_too", "answers"), [(15, False, True), (16, False, False), (16, True, True)]
+)
+def test_after_a_restore_the_answers_of_a_unit_are_those_that_its_pages_have(
+    desk: Desk, attempts: int, builds_too: bool, answers: bool
+) -> None:
+    """Of an office that is a line of the job as well, attempts are its own boards'."""
+    board = make_board(1)
+    stations = {desk.line.fingerprint: 1, **({desk.office.fingerprint: 1} if builds_too else {})}
+    request = asked_for(desk, desk.request(desk.run(), board), board, stations=stations)
+    with desk.office.transaction():
+        row = UnitRow(request.job, board.uuid, 1, "2026-01-31T12:00:00Z", attempts=attempts)
+        desk.office.plant.line.put_unit(row)
+    reply = desk.asks(request)
+    assert (bool(reply.security), reply.why) == (answers, "" if answers else "the unit already has 16 answers")
+
+
 @pytest.mark.parametrize(
     ("own", "asked", "sequence"),
     [(0, 0, 1), (9, 3, 10), (3, 9, 10), (9, 9, 10), (4, 65_539, 65_540), (4, 65_540, None), (0, 65_535, 65_536)],
@@ -154,9 +195,7 @@ def test_a_job_that_names_another_office_or_lists_another_board_or_key_signs_not
     key = desk.office.pins
 
     def refused(**changes: Any) -> tuple[str, str]:
-        named = {"stations": {desk.line.fingerprint: 3}, "sign": desk.office.fingerprint, **changes}
-        made = take_job(desk.office, job_of(desk.office, registry=desk.plant.roster.registry, **named))
-        reply = desk.asks(proven(replace(good, job=made.id), desk.line, board))
+        reply = desk.asks(asked_for(desk, good, board, **changes))
         return reply.refused, reply.why
 
     assert refused(sign="5c" * 32) == ("job", "the job names another office")
