@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import PolicyError, UsageError
+from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.plant import (
     apply_pages,
     doctor,
@@ -28,11 +28,13 @@ from teds_provision.plant import (
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.plant import evidence, job, roster, sharing, signing
 from teds_provision.protocol.plant.claim import Claim
+from teds_provision.protocol.plant.document import MemberRequest
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share
 from teds_provision.station.plant.pages import PageRow
 from teds_provision.station.station import Station
 from tests.cli.shell import call
 from tests.plant.owner import ALL, alone, ca_of, join, member, roster_of
+from tests.plant.stations import LOGIN
 
 NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
 NODE = bytes.fromhex("8d4d9da65281f7000000")
@@ -262,6 +264,76 @@ def test_the_last_page_of_a_retired_one_is_the_newest_here_and_of_a_lost_one_it_
     assert owner.draft_removal(station, "west", "stolen", 1).removed[0].last == (1, "1" * 64)
     assert owner.draft_removal(station, "west", "stolen", 0).removed[0].last == (0, "")
     assert status.page_list(station, west.fingerprint, 1) == [(2, "2" * 64, "2026-01-02T00:00:00Z")]
+
+
+def test_a_page_to_remove_at_counts_and_is_the_one_that_the_next_page_follows(station: Station) -> None:
+    (west,) = others(station, west="line sign")
+    held(station, west)
+    pages = station.plant.pages
+    with station.transaction():
+        chain = pages.chain(west.fingerprint)
+        for n, hash, previous in ((1, "1" * 64, ""), (2, "2" * 64, "1" * 64), (2, "b" * 64, "1" * 64),
+                                  (3, "3" * 64, "b" * 64), (4, "4" * 64, "3" * 64)):  # fmt: skip
+            pages.add(chain.id, PageRow(n, hash, previous, "2026-01-01T00:00:00Z", "", b"", b"{}", bytes(64)))
+        pages.put_chain(replace(chain, counted=(3, "3" * 64)))
+    assert [owner.page_place(station, west.fingerprint, n) for n in range(4)] == [
+        (0, ""), (1, "1" * 64), (2, "b" * 64), (3, "3" * 64)
+    ]  # fmt: skip
+    for n in (4, 5):
+        with pytest.raises(NotFoundError, match=f"Page {n} of that station is missing here or does not count"):
+            owner.page_place(station, west.fingerprint, n)
+
+
+def request(station: Station, key: SoftwareKey, name: str = "west", **changes: Any) -> MemberRequest:
+    ca = ca_of(station).ca()
+    assert ca is not None
+    now = station.plant.roster
+    assert now is not None
+    made = MemberRequest(name, key.point, ca.sign(station_key_message(key.point)), LOGIN, now.created)
+    return replace(made, **changes)
+
+
+def test_who_may_be_added_to_a_roster(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    (west,) = others(station, west="line")
+    key, new = SoftwareKey(5000), SoftwareKey(6000)
+    gone = RemovedMember("gone", SoftwareKey(7000).point, frozenset({"line"}), "retired", (0, ""))
+    now = held(station, west, removed=(gone,))
+    base: Any = frozenset({"base"})
+
+    def refused(asked: MemberRequest, why: str) -> None:
+        with pytest.raises(PolicyError, match=why) as error:
+            owner.add(station, asked, base)
+        assert error.value.exit_code == 6
+
+    made = owner.add(station, request(station, new, "south"), base)
+    assert [one.name for one in made.members] == ["owner", "west", "south"]
+    assert made.members[2].roles == {"base"}
+    refused(request(station, new, "south", certificate=bytes(64)), "is not certified by this owner's CA")
+    refused(request(station, SoftwareKey(7000), "gone again"), "gone was removed with this key")
+    refused(request(station, key, "west"), "west is already a member")
+    refused(request(station, new, "west"), "There is already a member called 'west'")
+    line: Any = frozenset({"line"})
+    assert owner.says_the_same(now, owner.add(station, request(station, key), line)), "the same again"
+    for clock in (now.created, now.created - timedelta(days=300)):
+        monkeypatch.setattr(owner, "now", lambda clock=clock: clock)
+        day = timedelta(hours=24)
+        owner.add(station, request(station, new, "south", created=now.created + day), base)
+        refused(request(station, new, "south", created=now.created + day + SECOND), "dated 20.*, in the future")
+
+
+def test_keys_are_shared_with_members_that_have_base_and_one_share_of_the_same_nodes(station: Station) -> None:
+    west, south = others(station, west="line", south="base")
+    gone = RemovedMember("gone", SoftwareKey(7000).point, frozenset({"base"}), "retired", (0, ""))
+    hand, everything = ("group", "hand"), ("all", "")
+    before = (Share(hand, (south.fingerprint,)), Share(everything, (south.fingerprint,)))  # type: ignore[arg-type]
+    held(station, west, south, removed=(gone,), share=before)
+    for receiver in (west.fingerprint, gone.fingerprint, H):
+        with pytest.raises(PolicyError, match="does not have the role 'base'"):
+            owner.shared(station, Share(("all", ""), (south.fingerprint, receiver)))
+    changed = Share(("group", "hand"), (station.fingerprint,), forget=True)
+    assert owner.shared(station, changed).share == (before[1], changed)
+    assert owner.unshared(station, hand).share == (before[1],)
+    assert owner.unshared(station, ("group", "arm")).share == before
 
 
 def test_a_list_of_pages_to_choose_from_has_the_last_20(station: Station) -> None:
