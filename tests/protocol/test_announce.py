@@ -143,6 +143,25 @@ def test_forged_announces_move_a_node_less_and_less() -> None:
         assert claim.handle_announce(conflict, own, now) == own
 
 
+@pytest.mark.parametrize(("quiet", "moves"), [(599.9, False), (600.0, True)])
+def test_ten_minutes_without_a_conflict_forget_the_moves(quiet: float, moves: bool) -> None:
+    claim, own = AddressClaim(6, uniform=soon), 33
+    for _ in range(3):
+        own = forge(claim, own, 7.0)
+    assert (forge(claim, own, 7.0 + quiet) != own) is moves
+
+
+@pytest.mark.parametrize(("after", "leaves"), [(59.9, False), (60.0, True)])
+def test_a_place_among_the_twenty_is_free_again_after_a_minute(after: float, leaves: bool) -> None:
+    claim = AddressClaim(5, uniform=soon)
+    for second in range(20):
+        claim.handle_announce(Announce(33, 0, 6), 33, float(second))
+        assert claim.due(float(second)) == second
+        claim.announced(float(second))
+    claim.handle_announce(Announce(33, 0, 6), 33, after)
+    assert (claim.due(after) == after) is leaves
+
+
 def test_a_move_that_waits_is_none_with_an_actuator_claimed_or_once_the_address_was_set() -> None:
     claim = AddressClaim(6, uniform=soon)
     for _ in range(4):
