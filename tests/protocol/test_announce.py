@@ -70,6 +70,12 @@ def test_the_greater_crc_moves_to_the_next_address_that_it_has_not_heard() -> No
     assert claim.due(1.0) == 1.0
 
 
+def test_239_is_an_address_like_another_and_followed_by_1() -> None:
+    claim = AddressClaim(6, uniform=soon)
+    assert claim.handle_announce(Announce(238, 0, 5), 238, 1.0) == 239
+    assert claim.handle_announce(Announce(239, 0, 5), 239, 1.0) == 1
+
+
 def test_with_an_actuator_claimed_it_stays_and_announces() -> None:
     claim = AddressClaim(6, uniform=soon)
     assert claim.handle_announce(Announce(33, 0, 5), 33, 1.0, pinned=True) == 33

@@ -92,6 +92,15 @@ def test_our_frames_are_what_the_profile_says() -> None:
     assert wire.log[-1].data[1:] == b"\x00" + b"\xcc" * 6
 
 
+@pytest.mark.parametrize("fd", [False, True])
+def test_a_pair_asks_and_waits_as_the_profile_says(fd: bool) -> None:
+    params = Pair(0x21, 0xF1, lambda _frame: None, fd=fd)._logic.params
+    assert (params.blocksize, params.stmin, params.tx_padding) == (16, 0, 0xCC)
+    assert (params.rx_flowcontrol_timeout, params.rx_consecutive_frame_timeout) == (1000, 1000), "N_Bs and N_Cr, ms"
+    assert params.wftmax >= 10, "ten WAITs are borne"
+    assert (params.max_frame_size, params.tx_data_length) == (4095, 64 if fd else 8)
+
+
 def test_the_node_answers_in_the_form_in_which_it_was_asked() -> None:
     wire = Wire(fd=True)
     wire.station.send(bytes(200))
