@@ -5,11 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeRefusedError, NodeSilentError
+from teds_provision.errors import LinkError, NodeRefusedError, NodeSilentError
+from teds_provision.measure import topic_actuators
 from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.topic_actuators import WATCHED, TopicActuators
 from teds_provision.measure.verified_session import VerifiedSession
@@ -203,3 +205,85 @@ def scene_send(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     monkeypatch.setattr(TopicActuators, "_send", fails_once)
     return sent
+
+
+class Course:
+    """Set points one at a time on a clock of its own; the node refuses what it is told to, once each."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.scene = Scene(lambda: reply(1), dead_man=1000)
+        self.scene.actuators.close()
+        self.asked: list[str] = []
+        self.refused: dict[str, int] = {}
+        monkeypatch.setattr(
+            topic_actuators,
+            "time",
+            SimpleNamespace(monotonic=lambda: self.now, time=time.time, monotonic_ns=time.monotonic_ns),
+        )
+        monkeypatch.setattr(self.scene.node, "request", self.request)
+
+    def request(self, command: Command, _doing: str, *, within: float | None = None) -> bytes:
+        number = f"{command.command_class}.{command.function}"
+        text = {
+            "4.1": lambda: f"operate {command.payload[16]} s {int.from_bytes(command.payload[17:], 'big')} ms",
+            "3.2": lambda: f"value within {round(within or 0, 3):.1f} s",
+            "128.16": lambda: "clock",
+        }[number]()
+        self.asked.append(text)
+        if number in self.refused:
+            raise NodeRefusedError("No.", reason=self.refused.pop(number))
+        return b""
+
+    def at(self, now: float, *, age: float = 0.0) -> list[str]:
+        """Return what is asked of the node for a set point that comes at this time; the error is the last word."""
+        self.now, self.asked = now, []
+        try:
+            self.scene.actuators._apply(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, now - age))
+        except (NodeRefusedError, LinkError) as error:
+            self.asked.append(f"refused: {error.message}")
+        return self.asked
+
+
+def test_an_actuator_is_claimed_for_its_dead_man_and_again_when_that_has_run_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    course = Course(monkeypatch)
+    assert course.at(100.0) == ["operate 10 s 1000 ms", "value within 1.0 s"]
+    assert course.at(100.5, age=0.3) == ["value within 0.7 s"]
+    assert course.at(101.499) == ["value within 1.0 s"], "each value counts the dead-man anew"
+    assert course.at(102.5) == ["operate 10 s 1000 ms", "value within 1.0 s"]
+    assert course.at(103.0, age=1.0) == ["value within 0.0 s"]
+    assert course.at(103.1, age=1.001) == ["refused: It is 1.00 s old; the dead-man is 1000 ms."]
+
+
+def test_a_claim_that_the_node_ended_sooner_is_made_anew_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    course = Course(monkeypatch)
+    course.at(100.0)
+    course.refused = {"3.2": 2}
+    assert course.at(100.2) == ["value within 1.0 s", "operate 10 s 1000 ms", "value within 1.0 s"]
+    course.refused = {"3.2": 19}
+    assert course.at(100.4) == ["value within 1.0 s", "refused: No."], "the hardware bears no such value"
+    assert course.at(100.6) == ["operate 10 s 1000 ms", "value within 1.0 s"], "and what is claimed is asked anew"
+
+
+def test_an_actuator_of_another_session_is_not_moved_and_its_own_claim_is_no_refusal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    course = Course(monkeypatch)
+    course.refused = {"4.1": 17}
+    assert course.at(100.0) == ["operate 10 s 1000 ms", "refused: No."]
+    course.refused = {"4.1": 2}
+    assert course.at(100.1) == ["operate 10 s 1000 ms", "value within 1.0 s"]
+
+
+def test_a_value_in_between_goes_by_command_every_half_of_the_dead_man(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drive messages have no reply: a node that was cut off is noticed by a value that has one."""
+    course = Course(monkeypatch)
+    sent: list[int] = []
+    monkeypatch.setattr(
+        course.scene.actuators, "_is_driven", lambda *_words: bool(sent.append(round(course.now * 1000))) or True
+    )
+    commands = [k for k in range(80) if "value within 1.0 s" in course.at(100 + k / 64)]
+    assert commands == [*range(9), 40, 72], "64 a second; the rate is known with the tenth"
+    assert len(sent) == 80 - len(commands)
