@@ -10,6 +10,8 @@ import pytest
 from teds_provision import teds
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import frame, raw_tuple
+from teds_provision.teds.codec.model import Edition
+from tests.protocol.operation.kat import KAT
 from tests.teds.vectors import octets_of
 
 CHANNEL = {
@@ -22,6 +24,9 @@ CHANNEL = {
     "SelfTest": 0,
     "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 32},
 }
+
+
+EDITIONS: tuple[Edition, ...] = (2007, 2024)
 
 
 def block(access_code: int, *parts: bytes) -> bytes:
@@ -236,3 +241,65 @@ def test_a_bare_block_of_a_later_version_is_a_block(version: int) -> None:
     decoded = teds.decode(bytes([3, 5, 0, 255, 3, version, 1, 10, 1, 0]))
     assert not decoded.framed
     assert decoded.get("CalKey") == 0
+
+
+def sample(model: int, octets: int, bits: int | None) -> dict[str, object]:
+    form = {"DatModel": model, "ModLenth": octets}
+    return {"Sample": form if bits is None else {**form, "SigBits": bits}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"PhyUnits": teds.Units(4)}, None),
+        ({"PhyUnits": teds.Units(5)}, None),
+        ({"PhyUnits": teds.Units(4, extension=15)}, None),
+        ({"PhyUnits": teds.Units(4, kelvins=1)}, "units"),
+        ({"PhyUnits": teds.Units(5, radians=1)}, "units"),
+        ({"PhyUnits": teds.Units(3, kelvins=1)}, None),
+        ({"PhyUnits": teds.Units()}, None),
+        ({"LowLimit": 2.0, "HiLimit": 2.0}, None),
+        ({"LowLimit": 2.5, "HiLimit": 2.0}, "limits"),
+        ({"OError": 0.0}, None),
+        ({"OError": -0.5}, "negative"),
+        (sample(0, 8, 64), None),
+        (sample(0, 9, 64), "sample"),
+        (sample(0, 2, 17), "sample"),
+        (sample(1, 4, 32), None),
+        (sample(1, 8, 32), "sample"),
+        (sample(2, 8, 64), None),
+        (sample(2, 4, 64), "sample"),
+        (sample(3, 2, 17), "sample"),
+        (sample(4, 2, 99), None),
+        (sample(5, 8, 64), "sample"),
+        (sample(5, 9, 72), None),
+        (sample(5, 9, 73), "sample"),
+        (sample(5, 255, 2040), None),
+        (sample(6, 8, 64), "sample"),
+        (sample(6, 9, 73), "sample"),
+        (sample(6, 255, 2040), None),
+        (sample(7, 8, 64), None),
+        (sample(7, 4, 32), "sample"),
+        (sample(0, 2, None), "missing"),
+    ],
+)
+def test_values_at_the_edge_of_the_tables(changes: dict[str, object], code: str | None) -> None:
+    """Digital data and arbitrary have no exponents; octets of each data model, significant bits in them."""
+    for edition in EDITIONS:  # units spelled as tuples, and packed
+        octets = teds.compose(3, {**CHANNEL, "Sampling": {"SampMode": 1}, **changes}, edition=edition)
+        assert set(codes(octets)) == ({code} if code else set())
+
+
+@pytest.mark.parametrize(("nanoseconds", "late"), [(0, False), (999_999_999, False), (1_000_000_000, True)])
+def test_a_time_has_less_than_a_second_of_nanoseconds(nanoseconds: int, late: bool) -> None:
+    instant = (1).to_bytes(4, "big") + nanoseconds.to_bytes(4, "big")
+    assert ("time" in codes(block(5, raw_tuple(10, instant)))) == late
+
+
+@pytest.mark.parametrize("framed", [True, False], ids=["framed", "bare"])
+def test_a_security_teds_of_ours_is_judged_framed_and_bare(framed: bool) -> None:
+    octets = bytes.fromhex(KAT["security_teds"])
+    assert codes(octets if framed else octets[4:-2]) == {}
+    at = octets.index(b"\x69\x01", 4)  # field 105, ProfileVersion
+    twice = octets[4 : at + 3] + octets[at:-2]
+    assert codes(frame(twice) if framed else twice)["not-canonical"] == "error"

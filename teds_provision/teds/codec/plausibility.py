@@ -50,6 +50,8 @@ def _values(fields: Iterable[Field], spec_of: Callable[[int], FieldSpec | None],
     for field in fields:
         value = field.value
         if field.children:
+            if value.__class__ is Units:  # spelled as tuples: its interpretation is one of them
+                _exponents(field, find)
             spec = spec_of(field.type) or table.inner.get(field.type)
             if spec is not None:
                 _values(field.children, spec.by_type.get, table, find)
@@ -108,6 +110,13 @@ def _interpretation(field: Field, _spec: FieldSpec | None, find: Find) -> None:
     if units.interpretation > 5:
         message = f"{field.name} has interpretation {units.interpretation}; 0 to 5 are known."
         find("error", "enumeration", message, field.offset, field.name, "0 to 5", units.interpretation)
+    _exponents(field, find)
+
+
+def _exponents(field: Field, find: Find) -> None:
+    units = field.value
+    if not isinstance(units, Units):
+        return
     if units.interpretation in (4, 5) and units != Units(units.interpretation, extension=units.extension):
         message = f"{field.name} is digital data or arbitrary and yet has exponents."
         find("warning", "units", message, field.offset, field.name, "no exponents", "some")

@@ -286,3 +286,47 @@ def test_the_load_of_the_papers_sensor_on_can_fd(n: int, mean: float) -> None:
     most = budget.bus_load(length, n, 100_000, bitrate=500_000, data_bitrate=2_000_000)
     assert bare < mean < most
     assert most / bare < 1.35
+
+
+@pytest.mark.parametrize(("octets", "bare", "worst"), [(0, 67, 80), (1, 75, 90), (7, 123, 150), (8, 131, 160)])
+def test_bits_of_a_classic_frame(octets: int, bare: int, worst: int) -> None:
+    """54 bits up to the CRC and 8 an octet, a stuff bit after the fifth and then every fourth, 13 without any."""
+    assert (budget.classic_bits(octets, worst=False), budget.classic_bits(octets)) == (bare, worst)
+
+
+@pytest.mark.parametrize(
+    ("octets", "bare", "worst"),
+    [
+        (0, 5 + 27, 5 + 27 + 1),
+        (8, 69 + 27, 69 + 27 + 17),
+        (16, 133 + 27, 133 + 27 + 33),  # a CRC of 17 bits, the stuff count 4, fixed stuff bits 6
+        (20, 165 + 32, 165 + 32 + 41),  # 21, 4 and 7
+        (64, 517 + 32, 517 + 32 + 129),
+    ],
+)
+def test_bits_of_an_fd_frame(octets: int, bare: int, worst: int) -> None:
+    """36 bits up to the switch of the bit rate, 8 stuff bits in them at most, and 13 at the end, are slow."""
+    never = 10**12
+    assert round(budget.fd_seconds(octets, 1, never, worst=False)) == 36 + 13
+    assert round(budget.fd_seconds(octets, 1, never)) == 36 + 8 + 13
+    assert round(budget.fd_seconds(octets, never, 1, worst=False)) == bare
+    assert round(budget.fd_seconds(octets, never, 1)) == worst
+
+
+@pytest.mark.parametrize(("length", "bits"), [(8, 160), (15, 310), (16, 320), (17, 410), (239, 29 * 160 + 150)])
+def test_a_message_loads_a_classic_bus_with_full_frames_and_one_of_the_rest(length: int, bits: int) -> None:
+    assert budget.bus_load(length, 2, 10**9, bitrate=1000) == pytest.approx(bits / 1000 / 2)
+
+
+def test_a_message_loads_an_fd_bus_with_frames_of_64_and_one_of_the_next_length() -> None:
+    whole, rest = (budget.fd_seconds(octets, 500_000, 2_000_000) for octets in (64, 12))
+    for length, seconds in ((64, whole), (128, 2 * whole), (73, whole + rest), (63, whole), (9, rest)):
+        load = budget.bus_load(length, 1, 10**9, bitrate=500_000, data_bitrate=2_000_000)
+        assert load == pytest.approx(seconds)
+
+
+def test_frames_of_a_message() -> None:
+    lengths = (1, 8, 9, 15, 64, 65, 240)
+    assert [budget.frames(length, link="can", fd=False) for length in lengths] == [1, 1, 2, 2, 8, 9, 30]
+    assert [budget.frames(length, link="can", fd=True) for length in lengths] == [1, 1, 1, 1, 1, 2, 4]
+    assert {budget.frames(length, link="ble", fd=False) for length in lengths} == {1}
