@@ -18,6 +18,8 @@ from teds_provision.links.can.isotp import (
     Pair,
     Reassembly,
     addresses,
+    consecutive_frames,
+    first_frame,
     gap_seconds,
     padded,
     physical_id,
@@ -234,6 +236,15 @@ def test_a_frame_out_of_sequence_tears_a_message_and_the_one_before_does_not() -
     assert partial.add_frame(b"\x23" + bytes(7)) == "torn"
     assert partial.add_frame(b"\x20" + bytes(7)) == "torn"
     assert partial.add_frame(b"\x22" + bytes(7)) == "more"
+
+
+def test_a_flow_control_is_due_after_each_sixteen_frames() -> None:
+    head, rest = first_frame(bytes(range(200)) * 2, fd=False)
+    partial = Reassembly.begin(0x21, Frame(0x18DAF121, head))
+    assert partial is not None
+    taken = [partial.add_frame(frame) for frame in consecutive_frames(rest, fd=False)]
+    assert [number for number, what in enumerate(taken, 1) if what == "block"] == [16, 32, 48]
+    assert (taken[-1], bytes(partial.octets)) == ("whole", bytes(range(200)) * 2)
 
 
 def test_a_second_first_frame_begins_again() -> None:

@@ -135,6 +135,20 @@ def test_a_refusal_17_is_no_try(bus: MockBus) -> None:
     assert len(after) >= 3, "three tries are left"
 
 
+def test_no_try_begins_fifteen_seconds_after_the_first_frame_of_the_first(bus: MockBus) -> None:
+    """The node refuses for 9.9 s, takes each request slowly then, and does not reply."""
+
+    def node(data: bytes) -> list[tuple[float, str, bytes]]:
+        if data[0] >> 4 != 1:
+            return []
+        return [(0.0, "early", b"\7" + BUSY) if bus.now < 109.85 else (0.0, "flow", b"\x30\0\x7f")]
+
+    bus.node = node
+    took = 14 * 0.127
+    assert bus.fails(LONG) == (NodeSilentError, round(9.9 + took + 1.5 + took + 3.5, 3))
+    assert bus.firsts()[99:] == [9.9, round(9.9 + took + 1.5, 3)], "a third one would begin at 18.5 s"
+
+
 def test_without_a_flow_control_it_is_asked_again_within_n_bs(bus: MockBus) -> None:
     assert bus.fails(LONG)[0] is NodeSilentError
     waits = [round(later - sooner, 3) for sooner, later in zip(bus.firsts(), bus.firsts()[1:], strict=False)]
