@@ -373,6 +373,47 @@ def test_a_roster_is_renewed_for_so_many_days_from_now_never_from_before_the_one
         assert (made.version, made.previous, made.members) == (2, now.hash, now.members)
 
 
+def test_the_next_version_of_an_expired_roster_holds_for_a_day(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = station.plant.roster
+    assert own is not None
+    for after, ends in ((-timedelta(days=2), own.expires), (timedelta(days=5), own.expires + timedelta(days=6))):
+        monkeypatch.setattr(owner, "now", lambda after=after: own.expires + after)
+        assert owner.following(station).expires == ends
+
+
+def test_a_version_that_changes_nothing_says_the_same_unless_it_is_dated_earlier(station: Station) -> None:
+    own = station.plant.roster
+    assert own is not None
+    after = replace(own, version=2, created=own.created + SECOND)
+    assert owner.says_the_same(own, after)
+    assert not owner.says_the_same(None, after)
+    for changes in ({"created": own.created - SECOND}, {"expires": own.expires + SECOND}, {"members": ()},
+                    {"share": (Share(("all", ""), ()),)}):  # fmt: skip
+        assert not owner.says_the_same(own, replace(after, **changes))  # type: ignore[arg-type]
+
+
+def test_a_date_is_wrong_if_it_is_ahead_and_no_other_member_dates_its_pages_so(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (west,) = others(station, west="line")
+    own = held(station, west)
+    monkeypatch.setattr(owner, "now", lambda: own.created - timedelta(hours=24))
+    with pytest.raises(PolicyError, match=r"is dated .*, not in the future"):
+        owner.require_wrong_date(station, own)
+    clock = own.created - timedelta(hours=24) - SECOND
+    monkeypatch.setattr(owner, "now", lambda: clock)
+    late = f"{clock + timedelta(hours=24) + SECOND:%Y-%m-%dT%H:%M:%SZ}"
+    paged(station, station.fingerprint, 1, late)
+    paged(station, "f" * 64, 1, late)  # no member
+    paged(station, west.fingerprint, 1, f"{clock + timedelta(hours=24):%Y-%m-%dT%H:%M:%SZ}")
+    owner.require_wrong_date(station, own)
+    paged(station, west.fingerprint, 2, late)
+    with pytest.raises(PolicyError, match="The clock of this machine is behind: the newest page of west is dated"):
+        owner.require_wrong_date(station, own)
+
+
 def test_a_first_roster_has_this_station_alone_with_every_role_but_audit_for_90_days(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
