@@ -330,3 +330,74 @@ def test_frames_of_a_message() -> None:
     assert [budget.frames(length, link="can", fd=False) for length in lengths] == [1, 1, 2, 2, 8, 9, 30]
     assert [budget.frames(length, link="can", fd=True) for length in lengths] == [1, 1, 1, 1, 1, 2, 4]
     assert {budget.frames(length, link="ble", fd=False) for length in lengths} == {1}
+
+
+@pytest.mark.parametrize(
+    ("identifier", "found"),
+    [
+        (0x18EF01F1, (0x01, 0xF1)),
+        (0x18EFEFF7, (0xEF, 0xF7)),
+        (0x18EF00F1, None),
+        (0x18EFF0F1, None),
+        (0x18EF21F0, None),
+        (0x18EF21F8, None),
+        (0x18EF0000, None),
+        (0x18EE21F1, None),
+        (0x1CFF2001, (0xF1, 0, 0, 0x01)),
+        (0x1CFFFFEF, (0xF7, 3, 7, 0xEF)),
+        (0x1CFF4921, (0xF2, 1, 1, 0x21)),
+        (0x1CFF2000, None),
+        (0x1CFF20F0, None),
+        (0x1CFF0021, None),  # an Announce
+        (0x1CFE2021, None),
+        (0x18FF00F1, 0xF1),
+        (0x18FF00F7, 0xF7),
+        (0x18FF00F0, None),
+        (0x18FF00F8, None),
+        (0x18FF01F1, None),
+    ],
+)
+def test_what_an_identifier_names(identifier: int, found: tuple[int, ...] | int | None) -> None:
+    seen = [data_address(identifier), drive_address(identifier), trigger_station(identifier)]
+    assert [each for each in seen if each is not None] == ([] if found is None else [found])
+
+
+def pieces(assembly: StreamAssembly, *frames: tuple[int, int]) -> list[int | None]:
+    """Give frames of (segment, octets); what comes of each: the octets of a whole message."""
+    whole = [assembly.add_segment(segment, bytes([segment]) * octets) for segment, octets in frames]
+    return [None if message is None else len(message) for message in whole]
+
+
+def test_frames_that_make_no_message_are_counted_once_and_leave_nothing() -> None:
+    """A message of 15 octets: 8 and 7."""
+    doubled = StreamAssembly(15, fd=False)
+    assert pieces(doubled, (0, 8), (0, 8), (1, 7)) == [None, None, 15]
+    assert (doubled.broken, doubled.wrong) == (1, 0)
+    missing = StreamAssembly(15, fd=False)
+    assert pieces(missing, (1, 7), (0, 8), (2, 7), (1, 7), (3, 7), (0, 8), (1, 7)) == [None] * 6 + [15]
+    assert (missing.broken, missing.wrong) == (1, 0), "frames before the first segment 0 belong to no message"
+    for bad in ((0, 7), (0, 9)):
+        short = StreamAssembly(15, fd=False)
+        assert pieces(short, bad, (1, 7), (0, 8), (1, 8), (1, 7), (0, 8), (1, 7)) == [None] * 6 + [15]
+        assert (short.broken, short.wrong) == (0, 2)
+
+
+def test_the_last_frame_of_fd_has_the_next_length_that_fd_knows() -> None:
+    """73 octets: 64 and 9, which go in 12; a Drive message of 20 goes with its segment in 24."""
+    data = StreamAssembly(73, fd=True)
+    assert pieces(data, (0, 64), (1, 12), (0, 64), (1, 9), (0, 64), (1, 12)) == [None, 73, None, None, None, 73]
+    assert (data.broken, data.wrong) == (0, 1)
+    driven = StreamAssembly(20, fd=True, drive=True)
+    assert [driven.add_drive_segment(bytes(octets)) for octets in (21, 24, 20)] == [None, bytes(20), None]
+    assert driven.wrong == 2
+
+
+def test_a_drive_message_has_7_octets_a_frame_and_segments_to_7() -> None:
+    message = bytes(range(60))
+    frames = list(cut(message, fd=False, drive=True))
+    assert [piece.data[0] for piece in frames] == [0, 1, 2, 3, 4, 5, 6, 7, 1]
+    assembly = StreamAssembly(60, fd=False, drive=True)
+    assert [assembly.add_drive_segment(piece.data) for piece in frames] == [None] * 8 + [message]
+    assert assembly.add_drive_segment(bytes([8]) + bytes(7)) is None
+    assert assembly.add_drive_segment(b"") is None
+    assert (assembly.broken, assembly.wrong) == (0, 0), "no segment at all"

@@ -221,3 +221,25 @@ def test_over_ble_a_message_comes_whole_and_in_no_other_length() -> None:
     bench.tim.drive("ble:2", sealer.seal(0, DriveValues(until, octets).encode()))
     assert (bench.hardware.points[4], bench.hardware.points[6]) == (b"\x03\xe8", b"\x03\xe9")
     assert clock(bench, "ble:2").last == 0
+
+
+def test_a_drive_message_begins_anew_with_segment_0_and_ends_with_a_frame_of_another_length(wheel: Wheel) -> None:
+    from teds_provision.protocol.operation.can_frames import cut
+
+    def hear(*frames: bytes) -> tuple[int, int]:
+        for frame in frames:
+            wheel.bench.tim.drive("can:f1", frame)
+        return wheel.points
+
+    def frames_of(value: int) -> list[bytes]:
+        return [piece.data for piece in cut(wheel.message(value, value), fd=False, drive=True)]
+
+    cut_short, whole = frames_of(1000), frames_of(1001)
+    assert [len(frame) for frame in whole] == [8, 8, 7], "20 octets: 7, 7 and 6, each after its segment"
+    assert hear(*cut_short[:2], *whole) == (1001, 1001), "segment 0 drops what was begun"
+    first, second, third = frames_of(1002)
+    assert hear(first, second[:-1], third) == (1001, 1001), "a short one"
+    assert hear(first, second, third + b"\xcc") == (1001, 1001), "a long one"
+    assert hear(first, third) == (1001, 1001), "one is missing"
+    assert hear(second, third) == (1001, 1001), "the first is missing"
+    assert hear(first, b"\x08" + second[1:], second, third) == (1002, 1002), "no segment: it is no frame of a message"
