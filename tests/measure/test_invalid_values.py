@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import time
 
 import numpy as np
@@ -13,6 +14,7 @@ from teds_provision.protocol.operation.commands import NOT_VALID
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.protocol.operation.subscription import StreamMessage, StreamPlan
 from teds_provision.teds.calibration import fit
+from teds_provision.teds.channel import SampleForm
 from tests.teds.test_interpreter import changed, sheet_of
 
 N, MS = 3, 1_000_000
@@ -65,3 +67,41 @@ def test_a_channel_without_calibration_counts_each_value_under_its_reason() -> N
         (1, "The datasheet is not signed"): 6,
         (2, "The datasheet is not signed"): 6,
     }
+
+
+def test_the_flag_of_a_message_marks_its_instants_alone_and_other_flags_nothing() -> None:
+    """operation.md section 3: bit 0 for some value in it, bit 7 a test pattern; others are ignored."""
+    heard, good = interpreter(), [(LOW, LOW)] * N
+    flagged = [message(0, *good), message(1, *good, flags=0x01), message(2, *good, flags=0x7E)]
+    [block] = heard.blocks([*flagged, message(3, *good, flags=0x80)])
+    assert block.valid[:, 0].tolist() == [True] * 3 + [False] * 3 + [True] * 3 + [False] * 3
+    np.testing.assert_array_equal(np.isnan(block.value), ~block.valid)
+    assert block.raw.tolist() == [[LOW, LOW]] * 12, "the raw values are kept"
+    [block] = heard.blocks([message(4, *good, flags=0x7E)])
+    assert block.valid.all()
+    assert reasons(heard.invalid) == {(1, NODE_SAYS_SO): 6, (2, NODE_SAYS_SO): 6}
+
+
+def test_a_gap_begins_a_new_block_and_ticks_go_on_by_the_period() -> None:
+    heard, good = interpreter(), [(LOW, LOW)] * N
+    blocks = heard.blocks([message(counter, *good) for counter in (0, 1, 3, 4, 5, 9)])
+    assert [(block.index, len(block.time)) for block in blocks] == [(0, 6), (9, 9), (27, 3)]
+    assert [block.tick.tolist() for block in blocks] == [
+        [10**9 + (block.index + k) * MS for k in range(len(block.time))] for block in blocks
+    ]
+    assert {(block.run, block.stream, block.channels) for block in blocks} == {(1, 0, (1, 2))}
+
+
+def test_channels_of_other_widths_stand_one_after_another_in_an_instant() -> None:
+    """A Float32 and two octets: 500.5 and 100, 250.25 and 200; the curves give a hundredth."""
+    sheet = changed(SHEET, 2, sample=SampleForm(1, 4))
+    plan = StreamPlan.for_channels(0, ((2, 4), (1, 2)), n=2, period=MS)
+    clock = ClockMap()
+    clock.exchange(Exchange(0, 2000, 500, 1500, 1, 20))
+    heard = StreamInterpreter(sheet, plan, 1, clock, HostClock(WallClock(1.8e9)), MonotonicStamps())
+    data = struct.pack(">fHfH", 500.5, 100, 250.25, 200)
+    [block] = heard.blocks([StreamMessage(0, 0, 10**9, 0, data)])
+    assert block.channels == (2, 1)
+    assert block.raw.tolist() == [[500.5, 100], [250.25, 200]]
+    np.testing.assert_allclose(block.value, [[5.005, 1.0], [2.5025, 2.0]], rtol=1e-6)
+    assert block.valid.all()

@@ -315,3 +315,17 @@ def test_how_many_messages_had_begun_at_a_tick() -> None:
     taker = receiver()
     found = [taker.begun(START + tick) for tick in (-1, 0, 20 * MS - 1, 20 * MS, 65 * MS)]
     assert found == [0, 1, 1, 2, 4]
+
+
+def test_only_bits_0_and_7_of_the_flags_mean_something() -> None:
+    taker = receiver()
+    for counter, flags in enumerate((0x00, 0x7E, 0x01, 0x7F)):
+        message = taker.open_message(sealed(counter, flags=flags), LATER)
+        assert message is not None
+        assert (message.valid, message.test_pattern) == (not flags & 1, False)
+    assert taker.open_message(sealed(4, flags=0xFE), LATER) is None
+    counted(taker, good=4, unasked=1)
+    pattern = receiver(test_pattern=True)
+    message = pattern.open_message(sealed(0, flags=0xFE), LATER)
+    assert message is not None
+    assert (message.valid, message.test_pattern) == (True, True)
