@@ -23,7 +23,8 @@ def test_a_label_is_read_back_by_a_camera_and_pins_the_key(home: Path, tmp_path:
     call(home, "whitelist", "add", UUID, "--fingerprint", KEY, "--name", "finger <1>")
     picture, drawing = tmp_path / "finger.png", tmp_path / "finger.svg"
     made = call(home, "--json", "label", "finger <1>", "--output", picture)
-    assert made.json["label"]["text"] == f"TEDS1:{UUID}:{KEY}".upper()
+    text = f"TEDS1:{UUID}:{KEY}".upper()
+    assert made.json == {"label": {"text": text, "uuid": UUID, "fingerprint": KEY, "file": str(picture)}}
     (found,) = zxingcpp.read_barcodes(image.open(picture).convert("L"))
     assert found.text == made.json["label"]["text"]
     call(home, "label", UUID, "--output", drawing)

@@ -6,9 +6,11 @@ import csv
 import json
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from teds_provision.cli.node import nodes as listing
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import (
@@ -248,3 +250,77 @@ def test_a_mistyped_name_is_guessed(fleet: Path) -> None:
         error = call(fleet, "--json", "whitelist", "remove", typed, "--yes").json["error"]
         assert (error["code"], f"Did you mean {meant}" in error["hint"]) == ("not-found", True), error
     assert "Did you mean" not in call(fleet, "--json", "group", "create", "x", "zzzz").json["error"]["hint"]
+
+
+FIRMWARE = {
+    "text": "loadcell/app",
+    "version": "1.2.3",
+    "build": 4,
+    "image": "ab" * 32,
+    "state": "good",
+    "from": "session",
+    "changed": False,
+}
+PLAIN: dict[str, Any] = {
+    "wrapped": None,
+    "firmware": FIRMWARE,
+    "revoked": None,
+    "moved_to": None,
+    "whitelisted": True,
+    "rotation_due": None,
+    "holders": [],
+    "keys": [{"state": "active"}],
+    "verdict": "authentic",
+    "retired": None,
+    "reading": {"from": "session", "at": "2026-01-31T12:00:00Z", "by": "verify"},
+}
+
+
+def test_what_is_odd_about_a_node_is_remarked() -> None:
+    for odd, remarks in (
+        ({}, ""),
+        ({"firmware": None}, ""),
+        ({"firmware": {**FIRMWARE, "state": "bad"}}, "firmware bad"),
+        ({"firmware": {**FIRMWARE, "state": "other"}}, "firmware other"),
+        ({"firmware": {**FIRMWARE, "state": "outdated"}}, "firmware outdated"),
+        ({"firmware": {**FIRMWARE, "state": "not-reported"}}, "firmware not-reported"),
+        ({"firmware": {**FIRMWARE, "state": "on-trial"}}, ""),
+        ({"firmware": {**FIRMWARE, "state": "pending"}}, ""),
+        ({"firmware": {**FIRMWARE, "state": "unjudged"}}, ""),
+        ({"firmware": {**FIRMWARE, "changed": True}}, "firmware changed since calibration"),
+        ({"wrapped": {"name": "scale", "kind": "canopen"}}, "wrapped: scale (canopen)"),
+        ({"revoked": {"why": "lost"}, "whitelisted": False}, "revoked: lost; not whitelisted"),
+        ({"moved_to": {"fingerprint": "cd" * 32}}, "moved to cdcdcdcdcdcdcdcd"),
+        ({"rotation_due": "it was handed over"}, "rotation due"),
+        (
+            {"holders": [{"fingerprint": "cd" * 32}, {"fingerprint": "ef" * 32}]},
+            "also held by cdcdcdcdcdcdcdcd, efefefefefefefef",
+        ),
+        ({"keys": [{"state": "active"}, {"state": "pending"}]}, "1 key pending"),
+        ({"keys": [{"state": "pending"}, {"state": "pending"}]}, "2 keys pending"),
+    ):
+        assert listing._remarks(PLAIN | odd) == remarks, odd
+
+
+def test_a_verdict_is_told_with_what_it_is_judged_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listing, "local_time", lambda text: f"<{text}>")
+    at = "<2026-01-31T12:00:00Z>"
+    for read, more, text in (
+        ("session", {}, f"authentic (read in a session {at}, by verify)"),
+        ("plain", {"verdict": "unproven"}, f"unproven (read without a session {at}, by verify)"),
+        ("kept", {}, f"authentic (Security TEDS read in a session, the rest from the stored copy {at}, by verify)"),
+        ("session", {"retired": "revoked"}, f"revoked; authentic (read in a session {at}, by verify)"),
+        (None, {"verdict": None}, "never verified"),
+        (None, {"verdict": "unverified"}, "unverified"),
+        (None, {"verdict": "unverified", "retired": "decommissioned"}, "decommissioned"),
+    ):
+        reading = None if read is None else {**PLAIN["reading"], "from": read}
+        assert listing._verdict({**PLAIN, **more, "reading": reading}) == text
+    charging = {"text": "wanted, 12 %", "at": "2026-01-31T12:00:00Z"}
+    assert listing._charge(charging) == f"wanted, 12 % (reported by the node at {at})"
+    assert listing._charge(None) == ""
+
+
+def test_a_long_cell_is_cut_with_a_mark_at_its_edge() -> None:
+    cells = [(text, listing._cut(text, limit)) for text, limit in (("12345", 5), ("123456", 5), ("123456", None))]
+    assert cells == [("12345", "12345"), ("123456", "1234…"), ("123456", "123456")]

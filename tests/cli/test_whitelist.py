@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord, WhitelistEntry
 from teds_provision.vault.selection import forget_vaults
@@ -171,3 +172,50 @@ def test_a_dash_is_stdout_and_no_file_of_that_name(
     assert printed.out == (tmp_path / "list").read_text()
     assert not (tmp_path / "-").exists()
     assert call(home, "--json", "whitelist", "export", "-").code == 2
+
+
+def test_what_each_change_of_the_list_says(home: Path, tmp_path: Path) -> None:
+    """Each step with what stands on stdout and, with JSON, in `removed`; an entry's key is shown by 32 digits."""
+    file, none = tmp_path / "list.csv", tmp_path / "none.csv"
+    for words, text in (
+        (["list"], "The whitelist is empty."),
+        (["add", ONE, "--name", "elbow", "--dry-run"], "Plan: 1 new, 0 changed, 0 unchanged."),
+        (["add", ONE, "--name", "elbow"], "Whitelist: 1 new, 0 changed, 0 unchanged."),
+        (["add", ONE], "Whitelist: 0 new, 0 changed, 1 unchanged (nothing to do)."),
+        (["export", none, "--dry-run"], f"Would write 1 entry as csv to {none}."),
+        (["export", file], f"Wrote 1 entry as csv to {file}."),
+        (["import", file, "--dry-run"], "Plan: 0 new, 0 changed, 1 unchanged."),
+        (["import", file], "Whitelist: 0 new, 0 changed, 1 unchanged (nothing to do)."),
+        (["export", "-", "--format", "csv", "--dry-run"], "Would write 1 entry as csv to -."),
+        (
+            ["remove", ONE, "--dry-run"],
+            f"Plan: remove {ONE} (elbow) from the whitelist and forget its key as last seen.",
+        ),
+        (["remove", ONE, "--yes"], f"{ONE} (elbow) is no longer on the whitelist."),
+        (["remove", ONE, "--yes"], f"{ONE} is not on the whitelist (nothing to do)."),
+        (["add", TWO, "--fingerprint", KEY], "Whitelist: 1 new, 0 changed, 0 unchanged."),
+        (["remove", TWO, "--dry-run"], f"Plan: remove {TWO} from the whitelist and forget its key {KEY[:32]}."),
+    ):
+        outcome = call(home, "whitelist", *words)
+        assert (outcome.code, outcome.out) == (0, f"{text}\n"), words
+    assert not none.exists()
+    for words, removed in ((["--dry-run"], False), (["--yes"], True), (["--yes"], False), (["--dry-run"], False)):
+        assert call(home, "--json", "whitelist", "remove", TWO, *words).json["removed"] is removed
+    with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as station, station.transaction():
+        station.nodes.remember(bytes.fromhex(ONE), point=SoftwareKey(9).point)
+    assert call(home, "--json", "whitelist", "remove", ONE, "--dry-run").json["removed"] is False
+    assert call(home, "whitelist", "remove", ONE, "--yes").out == (
+        f"{ONE} is not on the whitelist; its key is forgotten.\n"
+    )
+
+
+def test_the_list_unlocks_the_vault_before_it_takes_the_store(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A passphrase is typed while no other command waits."""
+    done: list[str] = []
+    unlock, lock = Station.unlock, Station.lock
+    monkeypatch.setattr(Station, "unlock", lambda self, *of: (done.append("unlock"), unlock(self, *of))[1])
+    monkeypatch.setattr(Station, "lock", lambda self, *of, **more: (done.append("lock"), lock(self, *of, **more))[1])
+    for words in (["add", ONE], ["remove", ONE, "--yes"]):
+        done.clear()
+        assert call(home, "whitelist", *words).code == 0
+        assert done[:2] == ["unlock", "lock"], words
