@@ -391,7 +391,7 @@ def test_a_version_that_changes_nothing_says_the_same_unless_it_is_dated_earlier
     assert not owner.says_the_same(None, after)
     for changes in ({"created": own.created - SECOND}, {"expires": own.expires + SECOND}, {"members": ()},
                     {"share": (Share(("all", ""), ()),)}):  # fmt: skip
-        assert not owner.says_the_same(own, replace(after, **changes))  # type: ignore[arg-type]
+        assert not owner.says_the_same(own, replace(after, **changes))
 
 
 def test_a_date_is_wrong_if_it_is_ahead_and_no_other_member_dates_its_pages_so(
