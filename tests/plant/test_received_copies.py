@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import timedelta
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -11,10 +12,12 @@ import pytest
 
 from teds_provision.handover.incoming import ImportPlan
 from teds_provision.plant.parcels import _is_over, _Reader
+from teds_provision.plant.transport import Parcel
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.roster import Share
-from teds_provision.station.plant.parcels import ParcelRow
+from teds_provision.station.plant.parcels import ParcelKind, ParcelRow, ParcelState
+from tests.plant.owner import alone
 from tests.plant.test_sharing import ALL, AT, EAST, KEY, NOW, OTHER, SOUTH, TO_SOUTH, WEST, roster, view
 
 NODE = SoftwareKey(77)
@@ -122,3 +125,34 @@ def test_what_was_not_receipted_is_over_when_it_expires(kind: Any, created: int,
     made, ends = (f"{NOW + timedelta(seconds=at):%Y-%m-%dT%H:%M:%SZ}" for at in (created, expires))
     row = ParcelRow("id", "out", "peer", kind, "sent", ends, "about", "", made)
     assert _is_over(row, NOW) is over
+
+
+def test_a_receipt_ends_the_parcel_of_its_bundle_to_its_sender_and_says_what_was_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = alone(tmp_path / "alone")
+    parcels = station.plant.parcels
+    kinds: list[tuple[str, str, ParcelKind, ParcelState, str]] = [
+        ("ours", SOUTH, "bundle", "sent", "bundle 1"), ("others", EAST, "bundle", "sent", "bundle 1"),
+        ("another", SOUTH, "bundle", "sent", "bundle 2"), ("ready", SOUTH, "bundle", "ready", "bundle 1"),
+        ("receipt", SOUTH, "receipt", "ready", "bundle 1"),
+    ]  # fmt: skip
+    rows = [
+        ParcelRow(id, "out", peer, kind, state, "2026-03-08T12:00:00Z", about) for id, peer, kind, state, about in kinds
+    ]
+    with station.transaction():
+        for row in rows:
+            parcels.put(row, b"sealed")
+        for row in rows[:4]:
+            parcels.put_shared([(A, 3), (B, 3)] if row.id == "ours" else [(row.id.encode().ljust(10), 3)], row.peer,
+                               row.id, "sent")  # fmt: skip
+    receipt = SimpleNamespace(id="bundle 1", sender=SOUTH, refused=[SimpleNamespace(uuid=A)])
+    monkeypatch.setattr("teds_provision.plant.parcels.pending.close", lambda *_: SimpleNamespace(receipt=receipt))
+    reader: Any = _Reader.__new__(_Reader)
+    reader.station = station
+    assert reader._receipt(Parcel("parcel", "me", b"receipt", "", SOUTH))
+    assert {row.id for row in parcels.all("out", "ready", "sent")} == {"others", "another", "receipt"}
+    assert parcels.shared_in("ours") == [(A, 3, "refused"), (B, 3, "taken")]
+    assert [state for _, _, state in parcels.shared_in("ready")] == ["taken"]
+    assert [state for id in ("others", "another") for _, _, state in parcels.shared_in(id)] == ["sent", "sent"]
+    station.close()
