@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import struct
 import time
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from teds_provision.measure import interpreter as measure_interpreter
 from teds_provision.measure.blocks import InvalidValues
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
 from teds_provision.measure.interpreter import NODE_SAYS_SO, StreamInterpreter
@@ -105,3 +108,17 @@ def test_channels_of_other_widths_stand_one_after_another_in_an_instant() -> Non
     assert block.raw.tolist() == [[500.5, 100], [250.25, 200]]
     np.testing.assert_allclose(block.value, [[5.005, 1.0], [2.5025, 2.0]], rtol=1e-6)
     assert block.valid.all()
+
+
+def test_the_age_of_a_block_counts_from_its_last_instant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The node's clock is the host's; the first message has its instants at 1.000, 1.001 and 1.002 s."""
+    monkeypatch.setattr(measure_interpreter, "time", SimpleNamespace(monotonic=lambda: 1.010))
+    plan = StreamPlan.for_channels(0, ((1, 2), (2, 2)), n=N, period=MS)
+    clock = ClockMap()
+    clock.exchange(Exchange(0, 2000, 500, 1500, 1, 20))
+    heard = StreamInterpreter(SHEET, plan, 1, clock, HostClock(WallClock(1.8e9)), MonotonicStamps())
+    good = [(LOW, LOW)] * N
+    for messages, age in (([message(0, *good)], 0.008), ([message(1, *good), message(2, *good)], 0.002)):
+        [block] = heard.blocks(messages)
+        assert block.age == pytest.approx(age, abs=1e-4)
+    np.testing.assert_allclose(block.time - 1.8e9, 1.003 + np.arange(6) / 1000, atol=1e-5)

@@ -445,3 +445,19 @@ def test_a_share_of_the_budget_is_rounded_up() -> None:
     assert bench.reason(subscribe(n=1, gap=2, period=4001)) is None, "⌈999750.06⌉ = 999751 ppm"
     assert bench.reason(subscribe(stream=1, n=1, period=16_064_258)) is None, "⌈248.9⌉ = 249: 10^6 are full"
     assert bench.reason(subscribe(stream=1, n=1, period=16_064_256)) == Reason.DOES_NOT_FIT, "⌈249.0000…⌉ = 250"
+
+
+def test_over_ble_nothing_streams_to_a_station_that_does_not_hear_it() -> None:
+    """Data messages have to be enabled before Subscribe; that is checked before what the channels are."""
+    bench = Bench().open("ble:2", SessionPort("ble", "ble", 2, mtu=247, hears=False)).operate(1, 4, link="ble:2")
+    sent(
+        bench,
+        [
+            ("form first", raw_subscribe(0, 0, 0, 1), U.BAD_FORM),
+            ("not enabled", subscribe(), U.WRONG_STATE),
+            ("not enabled, an actuator", subscribe(channels=(4,)), U.WRONG_STATE),
+            ("Drive needs no notification", drive([4]), None),
+            ("nor does Sample", sample([1]), None),
+        ],
+        "ble:2",
+    )
