@@ -9,7 +9,12 @@ from typing import Any
 
 import pytest
 
+from teds_provision.cli.context import App
 from teds_provision.protocol.keys import SoftwareKey, to_pem
+from teds_provision.station.station import Station
+from teds_provision.station.store.lock import _HeldFile
+from teds_provision.vault.selection import forget_vaults
+from tests.bench import PASSPHRASE
 
 from .shell import call
 
@@ -47,6 +52,22 @@ COMMANDS = (
     ("lock",),
 )
 
+SPARE = "8d4d9da65281f7000003"
+OTHERS = (
+    ("whitelist", "add", TWO, "--name", "finger"),
+    ("whitelist", "add", SPARE),
+    ("replace", TWO, SPARE, "--yes"),
+    ("replace", TWO, SPARE, "--yes"),
+    ("decommission", ONE, "--force", "--yes", *BUS),
+    ("build", SPARE, "--profile", "gripper"),
+    ("registry", "create", "--name", "plant", "--yes"),
+    ("registry", "renew", "--yes"),
+    ("registry", "request", "--output", "FOLDER/request"),
+    ("backup", "FOLDER/x.backup"),
+    ("restore", "FOLDER/x.backup", "--yes"),
+    ("vault", "rewrap"),
+)
+
 
 def rows(home: Path) -> dict[str, Any]:
     """Return every row of the store but those of the log, which has each run."""
@@ -79,3 +100,42 @@ def test_a_plan_of_what_is_finished_says_so_too(home: Path, tmp_path: Path, word
     more = {"whitelist": [ONE], "trust": ["lab"], "group": ["hand", ONE]}[words[0]]
     assert call(home, *words, *more, *(["--yes"] if words[0] == "trust" else [])).code == 0
     assert call(home, "--json", *words, *more, "--dry-run").code == 0
+
+
+def test_no_passphrase_is_asked_for_while_a_lock_is_held(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A person types it in their own time: another command must not wait for them."""
+    (tmp_path / "lab.pem").write_text(to_pem(SoftwareKey(51).point))
+    (tmp_path / "owner.pem").write_text(to_pem(SoftwareKey(52).point))
+    with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as station, station.transaction():
+        for uuid in (TWO, SPARE):
+            station.nodes.remember(bytes.fromhex(uuid))
+    held: list[Path] = []
+    asked: list[tuple[str, ...]] = []
+    enter, leave, ask = _HeldFile.__enter__, _HeldFile.__exit__, App.ask_secret
+
+    def entered(lock: _HeldFile) -> _HeldFile:
+        found = enter(lock)
+        held.append(lock._path)
+        return found
+
+    def left(lock: _HeldFile, *of: Any) -> None:
+        leave(lock, *of)
+        held.remove(lock._path)
+
+    def asks(app: App, prompt: str, confirm: bool = False) -> str:
+        asked.append(tuple(path.name for path in held))
+        return ask(app, prompt, confirm)
+
+    monkeypatch.setattr(_HeldFile, "__enter__", entered)
+    monkeypatch.setattr(_HeldFile, "__exit__", left)
+    monkeypatch.setattr(App, "ask_secret", asks)
+    found = {}
+    for words in (*COMMANDS, *OTHERS):
+        forget_vaults()
+        asked.clear()
+        assert call(home, "--json", *(word.replace("FOLDER", str(tmp_path)) for word in words)).code == 0, words
+        if any(asked):
+            found[words] = list(asked)
+    assert found == {}

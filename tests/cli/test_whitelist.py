@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -213,8 +214,17 @@ def test_the_list_unlocks_the_vault_before_it_takes_the_store(home: Path, monkey
     """A passphrase is typed while no other command waits."""
     done: list[str] = []
     unlock, lock = Station.unlock, Station.lock
-    monkeypatch.setattr(Station, "unlock", lambda self, *of: (done.append("unlock"), unlock(self, *of))[1])
-    monkeypatch.setattr(Station, "lock", lambda self, *of, **more: (done.append("lock"), lock(self, *of, **more))[1])
+
+    def noted_unlock(station: Station, *of: Any) -> None:
+        done.append("unlock")
+        unlock(station, *of)
+
+    def noted_lock(station: Station, *of: Any, **more: Any) -> Any:
+        done.append("lock")
+        return lock(station, *of, **more)
+
+    monkeypatch.setattr(Station, "unlock", noted_unlock)
+    monkeypatch.setattr(Station, "lock", noted_lock)
     for words in (["add", ONE], ["remove", ONE, "--yes"]):
         done.clear()
         assert call(home, "whitelist", *words).code == 0

@@ -102,12 +102,12 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     if dry_run:
         app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
-    station.unlock(octets)
     if is_finished(station, octets):
         app.emit(
             _result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is already out of service."
         )
         return
+    station.unlock()
     app.confirm(
         f"Take node {octets.hex()} out of service? Its key will be erased on the node and on this station.", yes=yes
     )
@@ -195,7 +195,6 @@ def replace(
     assert app is not None
     station = app.station()
     octets, spare = station.nodes.resolve(old), station.nodes.resolve(new)
-    station.unlock(octets)
     shown = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
     result, text = _takeover(shown)
     result["groups"] = station.groups.names_of_node(spare if shown.done else octets)
@@ -204,6 +203,7 @@ def replace(
         return
     receipt = None
     if not shown.done:
+        station.unlock()
         app.confirm(f"{text}?", yes=yes)
         # without the lock: it may wait for the node
         receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
