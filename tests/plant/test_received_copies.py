@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from datetime import timedelta
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,12 +11,16 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.handover.incoming import ImportPlan
-from teds_provision.plant.parcels import _is_over, _Reader
+from teds_provision.handover.pending import BundleNotes
+from teds_provision.plant.parcels import _expire, _is_over, _note_refused, _put_out, _Reader, waiting_out
 from teds_provision.plant.transport import Parcel
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.plant.parcels import ParcelKind, ParcelRow, ParcelState
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import Handover
 from tests.plant.owner import alone
 from tests.plant.test_sharing import ALL, AT, EAST, KEY, NOW, OTHER, SOUTH, TO_SOUTH, WEST, roster, view
 
@@ -156,3 +160,70 @@ def test_a_receipt_ends_the_parcel_of_its_bundle_to_its_sender_and_says_what_was
     assert [state for _, _, state in parcels.shared_in("ready")] == ["taken"]
     assert [state for id in ("others", "another") for _, _, state in parcels.shared_in(id)] == ["sent", "sent"]
     station.close()
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    made = alone(tmp_path / "alone")
+    yield made
+    made.close()
+
+
+def test_of_what_expired_without_a_receipt_an_open_move_goes_again_and_a_copy_is_made_anew(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parcels, again = station.plant.parcels, list[tuple[str, tuple[bytes, ...], str]]()
+
+    def planned(_station: Station, order: Any, _now: Any) -> str:
+        again.append((order.to[0], order.nodes, order.mode))
+        return "plan"
+
+    monkeypatch.setattr("teds_provision.plant.parcels.outgoing.plan_export", planned)
+    monkeypatch.setattr("teds_provision.plant.parcels.send_export", lambda *_: "")
+    cases: list[tuple[str, Any, str, str]] = [
+        ("open move", "move", "open", "2026-03-01T12:00:00Z"),
+        ("young move", "move", "open", "2026-03-01T12:00:01Z"),
+        ("closed move", "move", "closed", "2026-03-01T12:00:00Z"),
+        ("undone move", "move", "undone", "2026-03-01T12:00:00Z"),
+        ("copy", "copy", "open", "2026-03-01T12:00:00Z"),
+    ]
+    with station.transaction():
+        for name, mode, state, expires in cases:
+            notes = BundleNotes((A.hex(),), "content", "ca", expires).to_json()
+            station.handovers.put(Handover(name, "out", mode, (SOUTH,), state, notes))
+            parcels.put(ParcelRow(name, "out", SOUTH, "bundle", "sent", expires, name, "", "2026-02-22T12:00:00Z"), b"")
+            parcels.put_shared([(A, len(name))], SOUTH, name, "sent")
+    _expire(station, NOW)
+    assert again == [(SOUTH, (A,), "move")]
+    assert [row.id for row in parcels.all("out", "ready", "sent")] == ["young move"]
+    assert [name for name, *_ in cases if parcels.shared_in(name)] == ["young move"], "to be shared once more"
+
+
+def test_a_receiver_refuses_on_its_own_page_what_came_from_here(station: Station) -> None:
+    parcels = station.plant.parcels
+    bundles = [f"11111111-2222-4333-8444-{number:012}" for number in range(4)]
+    me = station.fingerprint
+    said = {SOUTH: {(bundles[0], me, "revoked"), (bundles[1], EAST, "revoked")}, EAST: {(bundles[2], me, "revoked")}}
+    with station.transaction():
+        for bundle in bundles:
+            row = ParcelRow(bundle, "out", SOUTH, "bundle", "sent", "2026-03-08T12:00:00Z", bundle)
+            parcels.put(row, b"")
+            parcels.put_shared([(A, int(bundle[-1]))], SOUTH, bundle, "sent")
+        for digits, refused in said.items():
+            chain = station.plant.pages.chain(digits)
+            station.plant.claims.put(chain.id, {A: Claim(refused=refused).to_json()})
+    _note_refused(station)
+    assert [row.id for row in parcels.all("out", "sent")] == bundles[1:]
+    assert [parcels.shared_in(bundle)[0][2] for bundle in bundles] == ["refused", "sent", "sent", "sent"]
+
+
+def test_a_receipt_waits_seven_days_and_a_bundle_until_it_expires(station: Station) -> None:
+    parcels = station.plant.parcels
+    with station.transaction():
+        receipt = _put_out(station, "receipt", SOUTH, b"receipt", "bundle")
+        bundle = _put_out(station, "bundle", SOUTH, b"bundle", "bundle", expires=NOW)
+    rows = {row.id: row for row in parcels.all("out", "ready")}
+    assert rows[bundle].expires == "2026-03-01T12:00:00Z"
+    left = datetime.fromisoformat(rows[receipt].expires) - datetime.now(UTC)
+    assert timedelta(days=6, hours=23) < left <= timedelta(days=7)
+    assert waiting_out(station) == 1, "a receipt is owed to nobody"

@@ -274,9 +274,22 @@ def test_spam_ends_at_256_mebibytes(rig: Rig) -> None:
 
 
 def test_a_parcel_waits_31_days_at_most(thief: Connection, rig: Rig) -> None:
+    send(thief, rig.victim, days=31)
     with pytest.raises(psycopg.Error) as refused:
         send(thief, rig.victim, days=32)
     assert refused.value.sqlstate == "TE004"
+
+
+def test_who_sends_takes_away_what_expired_of_its_own_and_of_nobody_else(rig: Rig) -> None:
+    sender, other = rig.database.member(), rig.database.member()
+    with sender.connect() as own, other.connect() as others:
+        expired, theirs, waiting = send(own, rig.third, days=-1), send(others, rig.third, days=-1), send(own, rig.third)
+        last = send(own, rig.third)
+    with rig.third.connect() as third:
+        there = {str(name) for (name,) in third.execute("select id from registry.parcel").fetchall()}
+        mine = [expired, theirs, waiting, last]
+        third.execute("delete from registry.parcel where id = any(%s::uuid[])", (mine,))
+    assert there & set(mine) == {theirs, waiting, last}
 
 
 def test_what_others_ask_is_not_seen(thief: Connection, rig: Rig) -> None:
