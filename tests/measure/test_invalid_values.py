@@ -122,3 +122,16 @@ def test_the_age_of_a_block_counts_from_its_last_instant(monkeypatch: pytest.Mon
         [block] = heard.blocks(messages)
         assert block.age == pytest.approx(age, abs=1e-4)
     np.testing.assert_allclose(block.time - 1.8e9, 1.003 + np.arange(6) / 1000, atol=1e-5)
+
+
+@pytest.mark.parametrize(("raw", "dtype"), [(2**53 - 1, "float64"), (2**53 + 1, "object"), (2**63 + 1, "object")])
+def test_raw_values_of_different_forms_stay_exact(raw: int, dtype: str) -> None:
+    """A Float32 beside an integer of 8 octets: from 2^53 on, a Float64 would change it."""
+    sheet = changed(changed(SHEET, 2, sample=SampleForm(1, 4)), 1, sample=SampleForm(0, 8))
+    plan = StreamPlan.for_channels(0, ((2, 4), (1, 8)), n=1, period=MS)
+    clock = ClockMap()
+    clock.exchange(Exchange(0, 2000, 500, 1500, 1, 20))
+    heard = StreamInterpreter(sheet, plan, 1, clock, HostClock(WallClock(1.8e9)), MonotonicStamps())
+    [block] = heard.blocks([StreamMessage(0, 0, 10**9, 0, struct.pack(">fQ", 0.5, raw))])
+    assert [int(value) if k else float(value) for k, value in enumerate(block.raw[0])] == [0.5, raw]
+    assert block.raw.dtype == np.dtype(dtype)

@@ -8,7 +8,9 @@ from __future__ import annotations
 import pytest
 
 from teds_provision import teds
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec import tables
+from teds_provision.teds.codec.frame import checksum, frame, teds_class, tuples, unframe
 from teds_provision.teds.codec.model import ONLY_2024, TEXT_BASED
 
 # Type, name, kind of value, need; the sub-fields of a structure follow it, indented.
@@ -305,4 +307,52 @@ def test_names_in_the_numbering_of_the_text_are_read_as_well() -> None:
         (3, "TEDSID"),
         (4, "Format"),
         (5, "TCName"),
+    ]
+
+
+def test_a_teds_is_its_length_the_block_and_one_s_complement_of_the_sum() -> None:
+    """The smallest has 12 octets; the sum is modulo 65536, the Length included."""
+    whole = bytes.fromhex("00000008 030400010101 FFED")
+    assert frame(bytes.fromhex("030400010101")) == whole
+    assert unframe(whole) == bytes.fromhex("030400010101")
+    assert checksum(b"") == 0xFFFF
+    assert checksum(b"\xff" * 257) == 0xFFFF - 65535 == 0
+    assert checksum(b"\xff" * 258) == 0xFFFF - (65790 - 65536) == 0xFF01
+    assert checksum(b"\xff" * 300) == 0xD52B
+    for octets, words in (
+        ("0000000803", "A TEDS has at least 12 octets, this one 5."),
+        ("00000009 030400010101 FFEC", "The Length of this TEDS says 9 octets follow; 8 do."),
+        ("00000008 030400010101 FFEC", "The checksum of this TEDS is FFEC; its octets give FFED."),
+    ):
+        with pytest.raises(BadDataError) as refused:
+            unframe(bytes.fromhex(octets))
+        assert refused.value.message == words
+
+
+@pytest.mark.parametrize(
+    ("block", "found"),
+    [
+        ("030400050101", 5),
+        ("030500FF070201", 7),
+        ("0304000501", None),
+        ("030500FF0702", None),
+        ("030300050101", None),
+        ("030600050101FF", None),
+        ("040400050101", None),
+        ("", None),
+    ],
+)
+def test_the_class_is_the_third_from_the_end_of_a_tedsid_of_either_edition(block: str, found: int | None) -> None:
+    assert teds_class(bytes.fromhex(block)) == found
+
+
+def test_only_the_tedsid_at_the_front_has_a_length_of_one_octet_whatever_the_width() -> None:
+    block = bytes.fromhex("0304000C0102 04000100 0500020041 03000100".replace(" ", ""))
+    with pytest.raises(BadDataError, match="The tuple of type 5 at octet 10 runs past the end"):
+        list(tuples(block[:-6], width=2))
+    good = bytes.fromhex("0304000C0102 0400010A 0300010B".replace(" ", ""))
+    assert [(part.type, part.value, part.offset) for part in tuples(good, width=2)] == [
+        (3, bytes.fromhex("000C0102"), 0),
+        (4, b"\x0a", 6),
+        (3, b"\x0b", 10),
     ]

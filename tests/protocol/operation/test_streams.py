@@ -113,10 +113,11 @@ def test_a_new_subscribe_ends_the_run_before_and_a_refused_one_does_not() -> Non
 # -- sending -----------------------------------------------------------------------------------------------------------
 
 
-def test_frames_leave_at_least_the_largest_gap_apart() -> None:
+@pytest.mark.parametrize("gaps", [(300, 700), (700, 300)])
+def test_frames_leave_at_least_the_largest_gap_apart(gaps: tuple[int, int]) -> None:
     bench = Bench().open().operate(1, 2)
-    Consumer(bench, 0, n=25, period=1 * MS, gap=300, start=100 * MS)
-    Consumer(bench, 1, (2,), n=5, period=10 * MS, gap=700, start=100 * MS)
+    Consumer(bench, 0, n=25, period=1 * MS, gap=gaps[0], start=100 * MS)
+    Consumer(bench, 1, (2,), n=5, period=10 * MS, gap=gaps[1], start=100 * MS)
     bench.until(500 * MS)
     at = [tick for tick, _ in bench.frames]
     apart = [later - before for before, later in itertools.pairwise(at)]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from teds_provision.protocol.messages.frames import decode_reply
 from teds_provision.protocol.operation.commands import ChannelState, write_data_set
 from teds_provision.protocol.operation.stream_commands import (
+    CLOCK,
     WAITS,
     Action,
     ArmCommand,
+    ClockReply,
 )
 from teds_provision.protocol.operation.timing import TriggerToken
 
@@ -107,3 +110,16 @@ def test_arm_needs_no_claim_and_a_new_one_replaces_that_of_its_action_alone() ->
     for token, seen in ((stop, 0), (mark, 2), (again, 3)):
         bench.tim.trigger("can:f1", token.octets, {0: 1}.get(seen, seen))
         assert clock(bench).mark == seen
+
+
+def test_a_clock_was_received_with_its_last_frame_and_sent_just_before_it_was_sealed() -> None:
+    bench = Bench().open().operate(1)
+    session = bench.sessions["can:f1"]
+    came = bench.hardware.tick
+    sealed = session.seal(CLOCK)
+    bench.hardware.tick += 3 * MS
+    outer = decode_reply(
+        bench.tim.handle(sealed.encode(), link="can:f1", tapped=False, port=bench.ports.get("can:f1"), received=came)
+    )
+    found = ClockReply.decode(session.unseal(outer.payload).payload)
+    assert found == ClockReply(came, came + 3 * MS, 0, 1000, 50, 0xFFFFFFFF)
