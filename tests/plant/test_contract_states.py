@@ -177,6 +177,8 @@ def test_each_station_has_its_state_and_age(station: Station, monkeypatch: pytes
         return f"{moment - timedelta(seconds=seconds):%Y-%m-%dT%H:%M:%SZ}"
 
     paged(station, station.fingerprint, 3, created(9))
+    paged(station, at["old"], 4, created(1), "4" * 64)  # an earlier page, of a clock that was ahead
+    paged(station, gone.fingerprint, 1, created(week + 1))
     for name, seconds, n in (
         ("old", week + 1, 5),
         ("due", week, 7),
@@ -199,7 +201,7 @@ def test_each_station_has_its_state_and_age(station: Station, monkeypatch: pytes
         ("quiet", 0, None, "nothing said"),
         ("torn", 4, 8, "two histories"),
         ("newer", 1, 8, "newer version"),
-        ("west", 0, None, "stolen"),
+        ("west", 1, week + 1, "stolen"),
     ]
     assert found.standings[-1].roles == ("line", "sign")
     assert found.exit_code == 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,17 @@ import pytest
 
 from teds_provision.handover.incoming import ImportPlan
 from teds_provision.handover.pending import BundleNotes
-from teds_provision.plant.parcels import _expire, _is_over, _note_refused, _put_out, _Reader, waiting_out
+from teds_provision.plant.parcels import (
+    _delete,
+    _due,
+    _expire,
+    _forget,
+    _is_over,
+    _note_refused,
+    _put_out,
+    _Reader,
+    waiting_out,
+)
 from teds_provision.plant.transport import Parcel
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.claim import Claim
@@ -227,3 +238,84 @@ def test_a_receipt_waits_seven_days_and_a_bundle_until_it_expires(station: Stati
     left = datetime.fromisoformat(rows[receipt].expires) - datetime.now(UTC)
     assert timedelta(days=6, hours=23) < left <= timedelta(days=7)
     assert waiting_out(station) == 1, "a receipt is owed to nobody"
+
+
+# -- what is copied, and what is deleted then --------------------------------------------------------------------------
+
+C, D, E = (bytes([number] * 10) for number in (3, 4, 5))
+IMU = Share(("profile", "imu"), (SOUTH,))
+
+
+def due(
+    views: dict[bytes, MergedClaims], *shares: Share, own: Sequence[bytes] = (), imported: Sequence[bytes] = (),
+    quiet: set[str] | None = None, removed: bool = True,
+) -> tuple[list[bytes], list[bytes]]:  # fmt: skip
+    """Return the nodes of which south gets a copy from west, and apart those that stations disagree about."""
+
+    def unshared(receiver: str, **more: bool) -> list[tuple[bytes, int, str]]:
+        assert receiver == SOUTH
+        return [(uuid, *KEY) for uuid in (imported if more.get("imported") else own)]
+
+    parcels = SimpleNamespace(unshared=unshared)
+    station: Any = SimpleNamespace(fingerprint=WEST, plant=SimpleNamespace(parcels=parcels))
+    held_roster = roster(*shares)
+    if not removed:
+        held_roster = replace(held_roster, removed=())
+    return _due(station, held_roster, lambda uuids: {uuid: views[uuid] for uuid in uuids}, SOUTH, quiet or set())
+
+
+def test_a_receiver_gets_what_a_share_covers_disputed_nodes_apart_and_none_that_it_gave_away() -> None:
+    away = frozenset({(SOUTH, 3, "a1", WEST, "move", "id")})
+    views = {
+        A: seen(),
+        B: seen(conflicts={"two keys": "x"}),
+        C: seen(gave=away),
+        D: seen(written={WEST: (1, "e5" * 32, "imu")}),
+        E: seen(written={SOUTH: (1, "e5" * 32, "imu")}),
+    }
+    assert due(views, TO_SOUTH, own=[A, B, C, D, E]) == ([A, D, E], [B])
+    assert due(views, IMU, own=[A, B, C, D, E]) == ([D], []), "what this station itself wrote"
+    assert due(views, IMU, TO_SOUTH, own=[A, D]) == ([A, D], [])
+    assert due(views, Share(ALL, (EAST,)), own=[A]) == ([], []), "it is for another station"
+
+
+def test_a_key_that_others_made_is_copied_only_if_its_maker_is_removed_or_silent_and_it_is_this_ones_turn() -> None:
+    views = {
+        A: seen(held={WEST: KEY, AT["north"]: KEY}, made=frozenset({AT["north"]})),
+        B: seen(held={WEST: KEY}, made=frozenset(), left={AT["gone"]: KEY}),
+        C: seen(held={WEST: KEY}, made=frozenset()),  # who made it is unknown
+    }
+    assert due(views, TO_SOUTH, imported=[A, B, C]) == ([B], [])
+    assert due(views, TO_SOUTH, imported=[A, B, C], removed=False) == ([], []), "nobody left: it is not even asked"
+    assert due(views, TO_SOUTH, imported=[A, C], quiet={AT["north"]}, removed=False) == ([A], [])
+
+
+def test_keys_are_deleted_that_all_receivers_of_a_forgetting_share_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    deleted: list[tuple[bytes, int]] = []
+    monkeypatch.setattr("teds_provision.plant.parcels._delete", lambda _, uuid, epoch: deleted.append((uuid, epoch)))
+    receipted = [(A, 3, {SOUTH, AT["north"]}), (B, 3, {SOUTH}), (C, 2, {SOUTH, AT["north"], EAST})]
+    parcels = SimpleNamespace(receipted=lambda: receipted)
+    station: Any = SimpleNamespace(fingerprint=WEST, plant=SimpleNamespace(parcels=parcels))
+    both = (SOUTH, AT["north"])
+    for shares, gone in (
+        ((Share(ALL, both, forget=True),), [(A, 3), (C, 2)]),
+        ((Share(ALL, both),), []),
+        ((Share(ALL, both, forget=True), Share(("profile", "imu"), (WEST,))), [(A, 3), (C, 2)]),
+        ((Share(ALL, both, forget=True), Share(ALL, (WEST,))), []),
+        ((Share(("profile", "imu"), both, forget=True),), []),
+    ):
+        deleted.clear()
+        _forget(station, roster(*shares), lambda uuids: {uuid: seen() for uuid in uuids})
+        assert deleted == gone, shares
+
+
+def test_what_is_deleted_is_every_key_up_to_its_epoch_and_that_is_told(station: Station) -> None:
+    for epoch in (2, 3, 4):
+        station.keys.add_pending(A, key=bytes(16), key_id=bytes([epoch]) * 8, epoch=epoch)
+    station.keys.add_pending(B, key=bytes(16), key_id=bytes([9]) * 8, epoch=2)
+    _delete(station, A, 3)
+    assert [key.epoch for key in station.keys.keys_of(A)] == [4]
+    assert [key.epoch for key in station.keys.keys_of(B)] == [2]
+    [(_, _, text)] = station.plant.outbox(9)
+    assert '"act":"forgot"' in text
+    assert f'"uuid":"{A.hex()}","epoch":3' in text
