@@ -52,6 +52,8 @@ COMMANDS = (
     ("lock",),
 )
 
+# They only write a file that is named, or change nothing of the station (docs/contract/cli.md).
+NO_PLAN = frozenset({"label", "config", "lock", "node", "trust ca export", "registry request"})
 SPARE = "8d4d9da65281f7000003"
 OTHERS = (
     ("whitelist", "add", TWO, "--name", "finger"),
@@ -80,11 +82,34 @@ def rows(home: Path) -> dict[str, Any]:
         }
 
 
+def entries(home: Path) -> int:
+    """Return how many entries the log has: a plan leaves none."""
+    with closing(sqlite3.connect(f"file:{home / 'store.sqlite3'}?mode=ro", uri=True)) as database:
+        return int(database.execute("SELECT count(*) FROM audit").fetchone()[0])
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the files of a folder without the store, whose rows are compared, and without empty ones: locks."""
+    found = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("store.")]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found if path.stat().st_size}
+
+
+def require_a_plan_that_changes_nothing(home: Path, folder: Path, given: list[str], words: tuple[str, ...]) -> None:
+    """Run a command with `--dry-run`, and find neither a row, a file nor an entry of the log changed."""
+    if words[0] in NO_PLAN or " ".join(words[:3]) in NO_PLAN or " ".join(words[:2]) in NO_PLAN:
+        return
+    before = rows(home), entries(home), contents(folder)
+    plan = call(home, "--json", *given, "--dry-run")
+    assert plan.code == 0, (words, plan)
+    assert (rows(home), entries(home), contents(folder)) == before, words
+
+
 def test_a_finished_command_changes_nothing_and_exits_0(home: Path, tmp_path: Path) -> None:
     (tmp_path / "lab.pem").write_text(to_pem(SoftwareKey(51).point))
     (tmp_path / "owner.pem").write_text(to_pem(SoftwareKey(52).point))
     for words in COMMANDS:
         given = [word.replace("FOLDER", str(tmp_path)) for word in words]
+        require_a_plan_that_changes_nothing(home, tmp_path, given, words)
         first = call(home, "--json", *given)
         before = rows(home)
         again = call(home, "--json", *given)
@@ -133,9 +158,12 @@ def test_no_passphrase_is_asked_for_while_a_lock_is_held(
     monkeypatch.setattr(App, "ask_secret", asks)
     found = {}
     for words in (*COMMANDS, *OTHERS):
+        given = [word.replace("FOLDER", str(tmp_path)) for word in words]
+        if words in OTHERS:
+            require_a_plan_that_changes_nothing(home, tmp_path, given, words)
         forget_vaults()
         asked.clear()
-        assert call(home, "--json", *(word.replace("FOLDER", str(tmp_path)) for word in words)).code == 0, words
+        assert call(home, "--json", *given).code == 0, words
         if any(asked):
             found[words] = list(asked)
     assert found == {}
