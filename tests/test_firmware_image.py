@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
 from hypothesis import given
 from hypothesis import strategies as st
+from imgtool import keys
 
 from teds_provision import firmware_image
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
@@ -125,3 +128,68 @@ def test_an_image_names_one_board_and_one_counter_at_most() -> None:
     for protected in ((board, other), (board, board), (counter, counter)):
         with pytest.raises(BadDataError):
             named(*protected)
+
+
+_DIGEST = bytes(range(32))
+
+
+def _tlv(kind: int, octets: bytes, length: int | None = None) -> dict[str, Any]:
+    """Return a TLV as imgtool lists it: of a cut one there is less than its length."""
+    return {"type": kind, "len": len(octets) if length is None else length, "data": octets.hex()}
+
+
+def _named(protected: list[dict[str, Any]], beside: list[dict[str, Any]], digest: bytes = _DIGEST) -> tuple[Any, Any]:
+    info = {"tlv_area": {"tlvs_prot": protected, "tlvs": [_tlv(0x10, _DIGEST), *beside]}, "trailer": None}
+    return firmware_image._named_in(info, digest)
+
+
+def test_what_is_not_protected_by_the_signature_names_no_board_and_counts_nothing() -> None:
+    assert _named([], [_tlv(0x54A0, b"evil"), _tlv(0x50, b"\7\0\0\0")]) == (None, None)
+    assert _named([_tlv(0x54A0, b"good"), _tlv(0x50, b"\1\2\0\0")], [_tlv(0x54A0, b"evil")]) == ("good", 513)
+
+
+@pytest.mark.parametrize(
+    ("protected", "beside"),
+    [
+        ([_tlv(0x54A0, b"boa", 5)], []),
+        ([], [_tlv(0x22, b"\x30", 70)]),
+        ([], [_tlv(0x10, _DIGEST)]),
+        ([], [_tlv(0x12, bytes(64))]),
+    ],
+    ids=["a cut board", "a cut signature", "the digest twice", "another digest"],
+)
+def test_tlvs_that_are_cut_or_that_name_two_digests_are_none(
+    protected: list[dict[str, Any]], beside: list[dict[str, Any]]
+) -> None:
+    assert _named([], []) == (None, None)
+    with pytest.raises(BadDataError, match="not a whole MCUboot image"):
+        _named(protected, beside)
+
+
+def test_the_digest_that_was_computed_is_that_of_the_image() -> None:
+    with pytest.raises(BadDataError, match="not a whole MCUboot image"):
+        _named([], [], bytes(32))
+
+
+def test_a_board_is_shown_as_text_that_steers_no_terminal() -> None:
+    (board, _) = _named([_tlv(0x54A0, "nrf/\x1b[31m\u202eloadcell".encode())], [])
+    assert "\x1b" not in board
+    assert "\u202e" not in board
+    with pytest.raises(BadDataError, match="not UTF-8"):
+        _named([_tlv(0x54A0, b"\xff")], [])
+
+
+def test_of_a_longer_digest_the_first_32_octets_count(tmp_path: Path) -> None:
+    keys.ECDSA384P1.generate().export_private(str(tmp_path / "owner.pem"))
+    signed = load_firmware_image(sign(tmp_path, "1.0.0", tmp_path / "owner.pem"))
+    at = signed.octets.index(b"\x11\0\x30\0") + 4
+    assert signed.digest == signed.octets[at : at + 32]
+
+
+def test_a_key_with_a_passphrase_is_bad_data_with_the_way_out() -> None:
+    pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
+        Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")
+    )
+    with pytest.raises(BadDataError, match="encrypted with a passphrase") as refused:
+        read_key(pem)
+    assert "getpub" in refused.value.hint

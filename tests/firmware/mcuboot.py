@@ -36,25 +36,46 @@ class Owner:
         counter: int | None = None,
         text: str = "",
         signed: bool = True,
+        flags: int = 0,
+        header: int = HEADER,
+        octets: int | None = None,
+        protected: bytes = b"",
+        beside: bytes = b"",
+        named: bytes | None = None,
     ) -> bytes:
-        """Return a whole image."""
-        protected = b""
+        """Return a whole image.
+
+        ``header``, ``octets``: what its head states, where that is not so. ``protected``, ``beside``: more TLVs in and
+        behind the protected part. ``named``: the hash of the key that it names.
+        """
         if counter is not None:
             protected += struct.pack("<HHI", _COUNTER, 4, counter)
         if text:
             protected += struct.pack("<HH", _TEXT, len(text)) + text.encode()
         if protected:
             protected = struct.pack("<HH", _PROTECTED, len(protected) + 4) + protected
-        head = struct.pack("<IIHHII", _MAGIC, 0, HEADER, len(protected), len(payload), 0)
+        stated = len(payload) if octets is None else octets
+        head = struct.pack("<IIHHII", _MAGIC, 0, header, len(protected), stated, flags)
         head += struct.pack("<BBHII", *version, 0)
         body = head.ljust(HEADER, b"\0") + payload + protected
+        return self.image_of(body, signed=signed, beside=beside, named=named)
+
+    def image_of(self, body: bytes, *, signed: bool = True, beside: bytes = b"", named: bytes | None = None) -> bytes:
+        """Return an image of these octets before its TLVs."""
         digest = hashlib.sha256(body).digest()
         tlvs = struct.pack("<HH", _SHA256, 32) + digest
-        tlvs += struct.pack("<HH", _KEY_HASH, 32) + hashlib.sha256(self.public).digest()
+        if named != b"":
+            tlvs += tlv(_KEY_HASH, hashlib.sha256(self.public).digest() if named is None else named)
         if signed:
             signature = self.key.sign(body, ec.ECDSA(hashes.SHA256()))
             tlvs += struct.pack("<HH", _ECDSA, len(signature)) + signature
+        tlvs += beside
         return body + struct.pack("<HH", _TLVS, len(tlvs) + 4) + tlvs
+
+
+def tlv(kind: int, value: bytes) -> bytes:
+    """Return one TLV."""
+    return struct.pack("<HH", kind, len(value)) + value
 
 
 def digest_of(image: bytes) -> bytes:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import struct
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 from teds_provision.protocol.messages.frames import Command, Reason, Reply
 from tests.firmware import smp
 from tests.firmware.desk import CDesk
-from tests.firmware.mcuboot import Owner, digest_of
+from tests.firmware.mcuboot import Owner, digest_of, tlv
 from tests.firmware.smp import packet
 from tests.protocol.desk import META, NAME
 
@@ -235,6 +237,10 @@ def test_records_go_round_both_pages() -> None:
         desk.open()
     assert desk.about()[0] == digest_of(images[1])
     assert not desk.node.misused
+    records = desk.node.images[2 * SLOT :]
+    assert [len(page.rstrip(b"\xff")) > 0 for page in (records[:4096], records[4096:])] == [True, True], (
+        "the page before is erased when the one after it is full: a cut in between loses nothing"
+    )
 
 
 def test_without_an_image_of_its_owner_a_board_does_not_start() -> None:
@@ -243,6 +249,180 @@ def test_without_an_image_of_its_owner_a_board_does_not_start() -> None:
     assert desk.node.start() == NO_IMAGE
     desk.node.images = b"\xff" * len(desk.node.images)
     assert desk.node.start() == NO_IMAGE
+
+
+_COUNTS_3 = tlv(0x50, struct.pack("<I", 3))
+
+
+@pytest.mark.parametrize(
+    ("image", "counter", "starts"),
+    [
+        (OWNER.image(), False, True),
+        (OWNER.image(counter=3), True, True),
+        (OWNER.image(), True, False),
+        (OWNER.image(beside=_COUNTS_3), True, False),
+        (OWNER.image(beside=_COUNTS_3), False, False),
+        (OWNER.image(protected=tlv(0x50, b"\3\0")), True, False),
+        (OWNER.image(flags=0x04), False, False),
+        (OWNER.image(flags=0x08), False, False),
+        (OWNER.image(flags=0x10), False, False),
+        (OWNER.image(flags=0x20), False, True),
+        (OWNER.image(named=b""), False, False),
+        (OWNER.image(named=bytes(32)), False, False),
+        (OWNER.image(header=0x10, octets=0x1F0 + 7), False, False),
+        (OWNER.image(header=0x20, octets=0x1E0 + 7), False, True),
+        (OWNER.image(beside=tlv(0x77, b"of others")), False, True),
+        (OWNER.image(beside=tlv(0x77, b"")[:3]), False, False),
+    ],
+    ids=[
+        "no counter is kept", "a counter", "no counter", "an unprotected counter", "one that nobody keeps",
+        "a short counter", "AES-128", "AES-256", "not bootable", "another flag", "no key is named",
+        "another key is named", "a header of 16", "a header of 32", "an unknown TLV", "a cut TLV",
+    ],
+)  # fmt: skip
+def test_which_images_a_boot_loader_starts(image: bytes, counter: bool, starts: bool) -> None:
+    desk = CDesk()
+    desk.node.has_images(OWNER.public, image, counter=counter)
+    assert desk.node.start() == (0 if starts else NO_IMAGE)
+
+
+def test_an_image_whose_length_goes_round_is_none() -> None:
+    """Header and octets together are 64 by 32 bits: its TLVs would lie inside of its own header."""
+    desk, owner = CDesk(), Owner()
+    whole = owner.image(header=0x200, octets=0xFFFFFE40)
+    head = whole[:64]
+    signed = owner.image_of(head)
+    desk.node.has_images(owner.public, signed)
+    assert desk.node.start() == NO_IMAGE
+
+
+def test_only_a_protected_text_names_the_board() -> None:
+    for image, text in (
+        (OWNER.image(beside=tlv(0x54A0, b"evil")), ""),
+        (OWNER.image(protected=tlv(0x54A0, b"x" * 49)), ""),
+        (OWNER.image(protected=tlv(0x54A0, b"x" * 48)), "x" * 48),
+    ):
+        desk = CDesk()
+        desk.node.has_images(OWNER.public, image)
+        desk.restart()
+        assert desk.plain(Command(0, 128, 21)).payload[42:].decode() == text
+
+
+def test_a_board_without_a_security_counter_says_so_and_takes_an_older_image() -> None:
+    desk = Board.make(counter=False)
+    assert desk.about()[1] == MANAGES | SIGNED
+    desk.update(NEW)
+    desk.now += 20
+    desk.update(OLD)
+
+
+def test_an_image_that_never_starts_is_gone_afterwards() -> None:
+    desk = Board.make()
+    bad = _bent(NEW, 0x200 + 5)
+    desk.upload(bad)
+    desk.ask(smp.SET_STATE, smp.start(digest_of(NEW)))
+    assert len(desk.ask(smp.STATES)["images"]) == 2
+    desk.ask(smp.RESTART)
+    desk.open()
+    assert [state["version"] for state in desk.ask(smp.STATES)["images"]] == ["1.0.0"]
+
+
+def test_a_record_of_another_form_or_a_torn_one_decides_nothing() -> None:
+    desk = Board.make()
+    images = desk.node.images
+    record = b"B\2\1\0" + struct.pack("<II", 3, 99)
+    for bad in (record + struct.pack("<I", zlib.crc32(record)), b"B\1" + record[2:] + bytes(4)):
+        desk.node.images = images[: 2 * SLOT + 4096] + bad + images[2 * SLOT + 4096 + 16 :]
+        assert desk.node.start() == 0
+        assert desk.about()[0] == digest_of(OLD)
+    good = b"B\1" + record[2:]
+    good += struct.pack("<I", zlib.crc32(good))
+    desk.node.images = images[: 2 * SLOT + 4096] + good + images[2 * SLOT + 4096 + 16 :]
+    assert desk.node.start() == NO_IMAGE, "its slot is blank"
+
+
+def first_piece(image: bytes, octets: int, **more: object) -> bytes:
+    """Return the body of an upload's first piece."""
+    values = {"off": 0, "len": len(image), "sha": hashlib.sha256(image).digest(), "data": image[:octets]}
+    return smp.encode({name: value for name, value in (values | more).items() if value is not None})
+
+
+def test_which_upload_is_carried_on_and_which_begins_anew() -> None:
+    desk = Board.make()
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 500)) == {"off": 500}
+    assert desk.ask(smp.UPLOAD, smp.encode({"off": 500, "data": NEW[500:800]})) == {"off": 800}
+    assert desk.ask(smp.UPLOAD, smp.encode({"off": 500, "data": NEW[500:700]})) == {"off": 800}, "it is there already"
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 300)) == {"off": 800}, "the same image"
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 300, len=len(NEW) - 1)) == {"off": 300}, "another length"
+    desk.now += 10
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 200, sha=bytes(32))) == {"off": 200}, "another digest"
+    desk.now += 10
+    for octets in (400, 100):
+        assert desk.ask(smp.UPLOAD, first_piece(NEW, octets, sha=None)) == {"off": octets}, "without one: always"
+    desk.now += 10
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 300)) == {"off": 300}
+    desk.restart()
+    desk.open()
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 200)) == {"off": 200}, "nothing of it outlives a restart"
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 300, len=None)) == {"err": {"group": 1, "rc": 22}}
+    desk.now += 10
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 300, len=SLOT, sha=b"")) == {"off": 300}, "a slot may be filled"
+    assert desk.ask(smp.UPLOAD, smp.encode({"off": 300})) == {"rc": 3}
+
+
+def test_an_upload_that_is_whole_begins_anew_and_its_digest_has_32_octets() -> None:
+    desk = Board.make()
+    assert desk.upload(NEW) == {"off": len(NEW), "match": True}
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 300)) == {"off": 300}
+    desk.now += 10
+    short = OWNER.image(payload=b"short", counter=3)[:600]
+    digest = hashlib.sha256(short).digest()
+    for sha, answer in ((digest, {"match": True}), (digest[:31], {"match": False}), (b"", {})):
+        assert desk.ask(smp.UPLOAD, first_piece(short, 600, sha=sha)) == {"off": 600, **answer}
+        desk.now += 10
+
+
+def test_the_states_of_both_slots_are_shown_whole() -> None:
+    desk = Board.make()
+    old = {"version": "1.0.0", "hash": digest_of(OLD), "bootable": True, "permanent": False}
+    new = {"version": "1.2.3.45", "hash": digest_of(NEW), "bootable": True, "permanent": False}
+    runs, waits = {"slot": 0, "active": True, "pending": False}, {"slot": 1, "active": False}
+    kept = {**old, **runs, "confirmed": True}
+    assert desk.ask(smp.STATES) == {"images": [kept], "splitStatus": 0}
+    desk.upload(NEW)
+    there = {**new, **waits, "confirmed": False}
+    assert desk.ask(smp.STATES) == {"images": [kept, {**there, "pending": False}], "splitStatus": 0}
+    answer = desk.ask(smp.SET_STATE, smp.start(digest_of(NEW)))
+    assert answer == {"images": [kept, {**there, "pending": True}], "splitStatus": 0}
+    desk.ask(smp.RESTART)
+    desk.open()
+    trial = [{**new, **runs, "confirmed": False}, {**old, **waits, "pending": False, "confirmed": True}]
+    assert desk.ask(smp.STATES) == {"images": trial, "splitStatus": 0}
+    answer = desk.ask(smp.SET_STATE, smp.CONFIRM)
+    settled = [{**new, **runs, "confirmed": True}, {**old, **waits, "pending": False, "confirmed": False}]
+    assert answer == {"images": settled, "splitStatus": 0}
+    assert desk.ask(smp.SLOTS) == {
+        "images": [
+            {
+                "image": 0,
+                "slots": [{"slot": 0, "size": 16384}, {"slot": 1, "size": 16384, "upload_image_id": 0}],
+                "max_image_size": 16384,
+            }
+        ]
+    }
+    assert desk.ask(smp.PARAMETERS) == {"buf_size": 971, "buf_count": 1}
+
+
+def test_an_upload_that_flash_did_not_take_is_over_and_begins_anew() -> None:
+    desk = Board.make()
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 500)) == {"off": 500}
+    desk.node.fails(True)
+    assert desk.ask(smp.UPLOAD, smp.encode({"off": 500, "data": NEW[500:800]})) == {"err": {"group": 1, "rc": 12}}
+    desk.node.fails(False)
+    before = desk.node.images
+    assert desk.ask(smp.UPLOAD, smp.encode({"off": 500, "data": NEW[500:800]})) == {"off": 500}
+    assert desk.node.images == before, "nothing is written behind what failed"
+    assert desk.upload(NEW) == {"off": len(NEW), "match": True}
 
 
 @pytest.mark.parametrize("torn", [False, True], ids=["clean", "torn"])

@@ -2786,6 +2786,27 @@ PATTERNS = (
         "(sha, length) == (self._sha, self._length)",
         "tests/node/test_image_manager.py",
     ),
+    Pattern(
+        "an image's TLVs are whole",
+        "_named_in",
+        'any(len(tlv["data"]) != 2 * tlv["len"] for tlvs in lists for tlv in tlvs)',
+        "False",
+        "tests/test_firmware_image.py",
+    ),
+    Pattern(
+        "an image names one digest, its own",
+        "_named_in",
+        "digests != [digest.hex()]",
+        "digest.hex() not in digests",
+        "tests/test_firmware_image.py",
+    ),
+    Pattern(
+        "of a longer digest the first 32 octets count",
+        "read_firmware_image",
+        "digest[:_DIGEST_OCTETS]",
+        "digest",
+        "tests/test_firmware_image.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

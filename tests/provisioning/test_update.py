@@ -635,3 +635,27 @@ def test_a_trial_that_nobody_confirms_ends_after_ten_minutes(
         slots.confirm()
     timer.work()
     assert (slots.running.version_text, slots.on_trial, len(KeptTimer.made)) == (runs, False, 1)
+
+
+def test_the_time_of_one_trial_ends_no_later_one(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(KeptTimer, "made", [])
+    monkeypatch.setattr(virtual, "threading", SimpleNamespace(Timer=KeptTimer))
+    slots, restarts = bench.node._slots, list[str]()
+    assert slots is not None
+    slots.write(0, owner.new.octets)
+    slots.flush()
+    for _ in range(2):
+        slots.start_next(owner.new.digest)
+        bench.node.restart()
+        bench.node.restart()
+    slots.start_next(owner.new.digest)
+    bench.node.restart()
+    bench.node.when_restarted(lambda: restarts.append(slots.running.version_text))
+    first, second, third = KeptTimer.made
+    first.work()
+    second.work()
+    assert (restarts, slots.on_trial) == ([], True)
+    third.work()
+    assert (restarts, slots.on_trial) == (["1.0.0"], False)

@@ -1018,7 +1018,7 @@ static void a_board_that_cannot_be_is_told_at_the_start(void)
         {33, good.slot_octets, 256, false, 0, TEDS_E_USAGE}, {12, good.slot_octets, 256, false, 0, TEDS_E_USAGE},
         {8, TEDS_STAGING + 255, 256, false, 0, TEDS_E_USAGE}, {8, good.slot_octets, 191, false, 0, TEDS_E_USAGE},
         {8, good.slot_octets, 256, true, 159, TEDS_E_USAGE}, {8, good.slot_octets, 256, true, 160, 0},
-        {8, good.slot_octets, 256, false, 159, 0},
+        {8, good.slot_octets, 256, false, 159, 0},      {64, good.slot_octets, 256, false, 0, TEDS_E_USAGE},
     };
     for (size_t i = 0; i < sizeof rows / sizeof rows[0]; i++) {
         board->port.unit = rows[i].unit;

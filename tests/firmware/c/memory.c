@@ -348,6 +348,9 @@ static int erase_page(void *user, int area, uint32_t at)
         board->misused = board->misused || !was_dead;
         return -1;
     }
+    if (board->fails) {
+        return -1;
+    }
     if (!fails || board->torn) {
         memset(there, 0xFF, fails ? IMAGES_PAGE / 2 : IMAGES_PAGE);
     }
@@ -361,6 +364,9 @@ static int write_image(void *user, int area, uint32_t at, const uint8_t *octets_
     uint8_t *there = image_at(board, area, at, length);
     if (was_dead || there == NULL || at % IMAGES_UNIT != 0 || length % IMAGES_UNIT != 0) {
         board->misused = board->misused || !was_dead;
+        return -1;
+    }
+    if (board->fails) {
         return -1;
     }
     for (size_t i = 0; i < length; i++) {
