@@ -10,8 +10,10 @@ import pytest
 
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NodeSilentError, NotAuthenticError
 from teds_provision.links import Contact, Notice
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, Reply, security_command
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.session import StationSession
 from teds_provision.provisioning import conversation
 from teds_provision.provisioning.conversation import Conversation, SessionLostError, came_under_key, is_busy, refused
 from tests.bench import Board, MemoryLink, contact, talk
@@ -174,6 +176,27 @@ def test_a_session_that_is_lost_is_opened_twice_again_and_no_more(board: Board) 
         node.request_idempotent(IDENTIFY, "to say who it is")
     assert opened == 2
     assert node._key == key
+
+
+def test_a_session_that_is_opened_again_refuses_the_same_static_keys(
+    board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """P(station) and P(node), of which a one-time key is none; without them at the first Open, none are known."""
+    asked: list[tuple[bytes, ...]] = []
+
+    class Noting(StationSession):
+        def __init__(self, key: bytes, uuid: bytes, *, statics: tuple[bytes, ...] = ()) -> None:
+            asked.append(statics)
+            super().__init__(key, uuid, statics=statics)
+
+    monkeypatch.setattr(conversation, "StationSession", Noting)
+    statics = (SoftwareKey(5).point, board.key.point)
+    node = Conversation(contact(board, on_bus(board)), notice=lambda _notice: None)
+    key = keyed(board)
+    node.open(key)
+    node.open(key, statics=statics)
+    node.reopen()
+    assert asked == [(), statics, statics]
 
 
 def test_a_reply_that_does_not_open_counts_as_a_lost_session(board: Board) -> None:

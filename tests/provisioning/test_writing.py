@@ -19,7 +19,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
-from tests.bench import Board, talk
+from tests.bench import Board, MemoryLink, talk
 
 from .test_provision import run
 
@@ -184,6 +184,68 @@ def test_a_write_is_in_the_store_with_its_facts_and_ends_its_own_draft_alone(
                 node,
                 third.with_block(SECURITY, replace(security.decode(third.blocks[SECURITY]), signature=None).encode()),
             )
+
+
+@dataclass
+class LosesCommit(MemoryLink):
+    """The reply to the first commit is lost."""
+
+    lost: bool = False
+
+    def exchange(self, frame: bytes) -> bytes:
+        before = self.board.state.sequence
+        reply = super().exchange(frame)
+        if self.board.state.sequence != before and not self.lost:
+            self.lost = True
+            raise NodeSilentError("The reply was lost.")
+        return reply
+
+
+def test_a_commit_whose_reply_is_lost_is_found_by_reading_the_security_teds(
+    station: Station, board: Board, image: Image
+) -> None:
+    signed = sign_image(station, SignOrder(image.uuid, renamed(image, "next")), None).signed.image
+    link = LosesCommit(board, via="can", tapped=False)
+    with talk(board, link) as node:
+        require_session(station, node)
+        assert write(station, node, signed).on_node == signed
+    assert link.lost
+    assert board.state.sequence == security.decode(signed.blocks[SECURITY]).sequence
+
+
+def test_what_the_store_has_of_a_node_and_the_node_lost_is_sent_after_all(
+    station: Station, board: Board, image: Image
+) -> None:
+    signed = sign_image(station, SignOrder(image.uuid, renamed(image, "next")), None).signed.image
+    gone = next(block for block in image if block not in (SECURITY, (0, 12)))
+    kept = {block: octets for block, octets in board.state.blocks.items() if block != gone}
+    board.flash.state = replace(board.state, blocks=kept)
+    board.power_on()
+    with talk(board) as node:
+        require_session(station, node)
+        assert write(station, node, signed).on_node == signed
+    assert board.state.blocks[gone] == image.blocks[gone]
+
+
+@pytest.mark.parametrize(("ahead", "commits"), [(1, 1), (65536, 1), (65537, 2), (131072, 2), (131073, 3)])
+def test_a_sequence_far_ahead_is_reached_in_steps_of_65536(
+    station: Station, board: Board, image: Image, monkeypatch: pytest.MonkeyPatch, ahead: int, commits: int
+) -> None:
+    made: list[int] = []
+
+    def commit(*args: Any) -> int:
+        made.append(security.decode(args[2].blocks[SECURITY]).sequence)
+        return one(*args)
+
+    one = writing._commit
+    monkeypatch.setattr(writing, "_commit", commit)
+    keys, present = writing.node_keys_of(image.uuid, image.blocks[SECURITY]), board.state.sequence
+    signed = writing.sign(station, keys, image, epoch=1, node_sequence=0, sequence=present + ahead).image
+    with talk(board) as node:
+        require_session(station, node)
+        write(station, node, signed, jump=True)
+    assert made == [*(present + 65536 * step for step in range(1, commits)), present + ahead]
+    assert board.state.sequence == present + ahead
 
 
 def test_which_image_is_written(station: Station, image: Image, tmp_path: Path) -> None:
