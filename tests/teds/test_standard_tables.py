@@ -5,13 +5,17 @@ Nothing here is computed from the tables that it holds.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from fractions import Fraction
+
 import pytest
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec import tables
-from teds_provision.teds.codec.frame import checksum, frame, teds_class, tuples, unframe
-from teds_provision.teds.codec.model import ONLY_2024, TEXT_BASED
+from teds_provision.teds.codec.frame import checksum, frame, raw_tuple, shape_of, teds_class, tuples, unframe
+from teds_provision.teds.codec.model import ONLY_2024, TEXT_BASED, Edition
 
 # Type, name, kind of value, need; the sub-fields of a structure follow it, indented.
 META = """
@@ -356,3 +360,135 @@ def test_only_the_tedsid_at_the_front_has_a_length_of_one_octet_whatever_the_wid
         (4, b"\x0a", 6),
         (3, b"\x0b", 10),
     ]
+
+
+@pytest.mark.parametrize(
+    ("octets", "shape"),
+    [
+        ("00000008 030400010101 FFED", "framed"),
+        ("00000009 030400010101 FFED", "framed"),  # a wrong Length in front of a TEDSID
+        ("030400010101", "block"),
+        ("030500FF030201", "block"),
+        ("0001 01 02 0005 0300000000", "message"),  # a command: channel, class, function, length
+        ("0001 01 02 0006 0300000000", "framed"),  # damaged: it counts one too many
+        ("0001 81 02 0001 00", "message"),  # a maker's class
+        ("0001 80 01 0001 00", "message"),
+        ("0001 7F 01 0001 00", "framed"),  # a reserved one
+        ("0001 08 02 0001 00", "framed"),
+        ("0001 07 01 0000", "message"),
+        ("0001 01 01 0001 03", "message"),
+        ("01 08 01 0000", "message"),  # a service of type 1, a command
+        ("0001 01 00 0001 00", "framed"),  # no function
+        ("01 0002 FFFF", "message"),  # a reply
+        ("00 0001 04", "message"),
+        ("02 0001 04", "framed"),
+        ("09 02 05 0001 00", "message"),  # a network service: type, id, message type, length
+        ("0A 02 05 0001 00", "framed"),
+        ("09 02 06 0001 00", "framed"),
+        ("03 04 01 0001 00", "message"),  # Update TEDS as a service, and no TEDSID
+        ("00000102 0100" + 256 * "00", "framed"),  # its Length counts it; as a command it would have class 1
+    ],
+)
+def test_a_teds_a_bare_block_and_a_message_are_distinguished_by_their_first_octets(octets: str, shape: str) -> None:
+    assert shape_of(bytes.fromhex(octets.replace(" ", ""))) == shape
+
+
+def test_a_tuple_holds_as_much_as_its_length_octets_can_count() -> None:
+    assert raw_tuple(5, bytes(255)) == bytes([5, 255]) + bytes(255)
+    assert raw_tuple(5, bytes(256), width=2) == bytes([5, 1, 0]) + bytes(256)
+    with pytest.raises(BadDataError, match="Field 5 has 256 octets; 1 length octets allow 255"):
+        raw_tuple(5, bytes(256))
+
+
+EDITIONS: tuple[Edition, ...] = (2007, 2024)
+PASCAL = teds.Units(kilograms=Fraction(1), meters=Fraction(-1), seconds=Fraction(-2))
+
+
+@pytest.mark.parametrize(
+    ("spelled", "units"),
+    [
+        ("32 01 00 35 01 7E 36 01 82 37 01 7C", PASCAL),
+        ("00 80 80 7E 82 7C 80 80 80 80 00", PASCAL),
+        ("00 80 80 7E 82 7C 80 80 80 80 80", PASCAL),  # 80 means no extension, too
+        ("00 80 80 7E 82 7C 80 80 80 80", PASCAL),  # without the octet of an extension
+        ("00 80 80 7E 82 7C 80 80 80 80 0F", replace(PASCAL, extension=15)),
+        ("32 01 00 35 01 7E 36 01 82 37 01 7C 3C 01 0F", replace(PASCAL, extension=15)),
+        ("00 80 80 80 80 7F 80 80 80 80 00", teds.Units(seconds=Fraction(-1, 2))),  # an octet is 2 · exponent + 128
+        ("01 82 80 80 80 80 80 80 80 80 00", teds.Units(1, radians=Fraction(1))),
+        ("05 80 80 80 80 80 80 80 80 84 00", teds.Units(5, candelas=Fraction(2))),
+        (
+            "04 80 82 80 80 80 84 80 82 80 00",
+            teds.Units(4, steradians=Fraction(1), amperes=Fraction(2), moles=Fraction(1)),
+        ),
+    ],
+)
+def test_units_are_read_in_each_of_three_spellings(spelled: str, units: teds.Units) -> None:
+    octets = bytes.fromhex(spelled)
+    decoded = teds.decode(bytes([3, 4, 0, 3, 1, 1, 12, len(octets)]) + octets)
+    assert decoded.get("PhyUnits") == units
+
+
+def test_units_are_written_as_tuples_in_2007_and_packed_in_2024() -> None:
+    old, new = (teds.compose(3, {"PhyUnits": PASCAL}, edition=edition)[4:-2] for edition in EDITIONS)
+    assert old.hex() == "030400030101" + "0c0c" + "32010035017e360182370 17c".replace(" ", "")
+    assert new.hex() == "030500ff030201" + "0c0b" + "0080807e827c8080808000"
+
+
+@pytest.mark.parametrize(
+    ("kind", "octets", "value"),
+    [
+        (10, "6955B900 00000001", teds.TimeInstance(0x6955B900, 1)),
+        (10, "00000005 80000002", teds.TimeInstance(5, 2, True)),  # the top bit is the sign of the whole
+        (10, "00006700 10B7 2575FEF3", teds.TimeInstance(0x670010B7, 0x2575FEF3)),
+        (13, "7FFFFFFF", None),  # the NaN that means "not available"
+        (13, "C2280000", -42.0),
+        (16, "3F800000 40000000", (1.0, 2.0)),
+    ],
+)
+def test_data_types_are_big_endian(kind: int, octets: str, value: object) -> None:
+    raw = bytes.fromhex(octets.replace(" ", ""))
+    decoded = teds.decode(bytes([3, 4, 0, 5, 1, 1, kind, len(raw)]) + raw)
+    (_, field) = decoded.fields
+    if value is None:
+        assert isinstance(field.value, float)
+        assert math.isnan(field.value)
+    else:
+        assert field.value == value
+
+
+@pytest.mark.parametrize(
+    ("edition", "seconds", "nanoseconds", "fits"),
+    [
+        (2007, (1 << 32) - 1, (1 << 31) - 1, True),
+        (2007, 1 << 32, 0, False),
+        (2007, 0, 1 << 31, False),
+        (2024, (1 << 48) - 1, (1 << 32) - 1, True),
+        (2024, 1 << 48, 0, False),
+        (2024, 0, 1 << 32, False),
+    ],
+)
+def test_a_time_has_32_and_31_bits_in_2007_and_48_and_32_in_2024(
+    edition: Edition, seconds: int, nanoseconds: int, fits: bool
+) -> None:
+    fields = {"LstCalDt": teds.TimeInstance(seconds, nanoseconds)}
+    if fits:
+        octets = teds.compose(5, fields, edition=edition)
+        assert len(octets) == 4 + (6 if edition == 2007 else 7) + 2 + (8 if edition == 2007 else 10) + 2
+        assert teds.decode(octets).get("LstCalDt") == fields["LstCalDt"]
+    else:
+        with pytest.raises(BadDataError, match="LstCalDt has"):
+            teds.compose(5, fields, edition=edition)
+
+
+@pytest.mark.parametrize(
+    ("raw", "value"),
+    [
+        (b"MFkwEwYHKoZIzj0=", "MFkwEwYHKoZIzj0="),
+        (b"-----BEGIN PUBLIC KEY-----\nMFkw\n", "-----BEGIN PUBLIC KEY-----\nMFkw\n"),
+        (b"\x04\x01\x02", b"\x04\x01\x02"),
+        (b"\xff" * 3, b"\xff" * 3),
+    ],
+)
+def test_a_key_is_text_if_it_can_be_read_and_octets_else(raw: bytes, value: object) -> None:
+    decoded = teds.decode(bytes([3, 4, 0, 128, 1, 1, 101, len(raw)]) + raw)
+    assert decoded.get("NodePublicKey") == value
