@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import BadDataError
+from teds_provision.plant.verify_evidence import EvidenceAnchors
 from teds_provision.protocol.handover.strict_json import Members
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.plant import evidence as codec
@@ -214,6 +215,57 @@ def test_a_fact_is_read_at_its_limit_and_not_beyond_it(member: str, value: objec
         codec._facts(Members(facts, "The facts"), facts)
 
 
+def enveloped(statement: dict[str, Any], **changes: Any) -> bytes:
+    """Return the envelope of a statement, of which nobody looks at the signature."""
+    envelope = {
+        "payload": base64.b64encode(json.dumps(statement).encode()).decode(),
+        "payloadType": "application/vnd.in-toto+json",
+        "signatures": [{"keyid": fingerprint(LINE.point), "sig": "AA=="}],
+    }
+    return json.dumps({**envelope, **changes}).encode()
+
+
+@pytest.mark.parametrize(
+    ("of_statement", "of_envelope"),
+    [
+        ({"_type": "https://in-toto.io/Statement/v0.1"}, {}),
+        ({"predicateType": "urn:x-teds-provision:evidence:2"}, {}),
+        ({}, {"payloadType": "application/json"}),
+        ({}, {"more": 1}),
+        ({}, {"signatures": []}),
+        ({}, {"signatures": [{"keyid": "a", "sig": "AA=="}] * 2}),
+        ({}, {"signatures": [{"keyid": "a", "sig": "AA==", "more": 1}]}),
+        ({}, {"signatures": [{"keyid": "a"}]}),
+    ],
+)
+def test_what_is_no_envelope_of_evidence_is_unreadable(
+    of_statement: dict[str, Any], of_envelope: dict[str, Any]
+) -> None:
+    codec.read(enveloped(sealed()))
+    with pytest.raises(BadDataError):
+        codec.read(enveloped({**sealed(), **of_statement}, **of_envelope))
+
+
+def test_a_step_that_had_nothing_to_do_is_no_failure() -> None:
+    good = tuple((f"step {word}", word, 1) for word in ("ok", "done", "nothing to do", "skipped"))
+    assert replace(FACTS, steps=good).failure is None
+    assert replace(FACTS, steps=(*good, ("agree", "node-silent", 1), ("verdict", "job", 1))).failure == "node-silent"
+
+
+def test_a_board_is_known_by_the_pins_file() -> None:
+    checked = CheckedEvidence(GOOD, SHOWN, "", b"", b"")
+    own = fingerprint(NODE.point)
+    for pins, expected in (
+        (None, []),
+        ({UUID: own}, []),
+        ({UUID: own[:32]}, []),
+        ({}, ["its UUID is not in the pins file"]),
+        ({UUID: ""}, ["its UUID is not in the pins file"]),
+        ({UUID: H}, ["its key differs from the one in the pins file"]),
+    ):
+        assert EvidenceAnchors(CA.point, pins).faults_of(checked, ALL_GOOD) == expected
+
+
 @pytest.mark.parametrize(
     ("nonce", "proof", "good"),
     [(16, 64, True), (0, 0, True), (16, 0, False), (0, 64, False), (15, 64, False), (17, 64, False), (16, 63, False)],
@@ -221,12 +273,7 @@ def test_a_fact_is_read_at_its_limit_and_not_beyond_it(member: str, value: objec
 def test_a_nonce_and_a_proof_are_there_both_or_neither(nonce: int, proof: int, good: bool) -> None:
     statement = sealed()
     statement["predicate"]["node"] |= {"nonce": "00" * nonce, "proof": "00" * proof}
-    envelope = {
-        "payload": base64.b64encode(json.dumps(statement).encode()).decode(),
-        "payloadType": "application/vnd.in-toto+json",
-        "signatures": [{"keyid": fingerprint(LINE.point), "sig": "AA=="}],
-    }
-    document = json.dumps(envelope).encode()
+    document = enveloped(statement)
     if good:
         assert (len(codec.read(document).nonce), len(codec.read(document).proof)) == (nonce, proof)
         return
