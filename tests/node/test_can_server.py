@@ -122,6 +122,18 @@ def test_answers_a_functional_identify_from_its_own_address(station: RawStation,
 
 
 @pytest.mark.parametrize("octets", ["0742000101010000", "06420000800700", "0842000080070000", "1042000080070000", "07"])
+def test_an_answer_to_everyone_waits_a_random_time_of_up_to_50_ms(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[float, float]] = []
+
+    def uniform(low: float, high: float) -> float:
+        drawn.append((low, high))
+        return 0.031
+
+    monkeypatch.setattr(server_module, "random", SimpleNamespace(uniform=uniform))
+    assert CanServer("udp_multicast:239.74.163.2")._spread() == 0.031
+    assert drawn == [(0, 0.05)]
+
+
 def test_answers_nothing_else_that_is_asked_of_everyone(station: RawStation, node: EchoNode, octets: str) -> None:
     station.everyone(octets)
     assert station.silence(0x21) == []
@@ -210,6 +222,12 @@ def test_an_overlong_message_is_refused_and_the_line_goes_on(station: RawStation
         "10, in place of a flow control"
     )
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+
+
+def test_a_request_of_max_message_and_its_transaction_is_taken(station: RawStation) -> None:
+    station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex("1fff000000000000")))  # 4094 and one
+    assert wait_for(lambda: bool(station.silence(0x21, seconds=0.1) or station.frames))
+    assert [frame.data[:3].hex() for frame in station.frames] == ["301000"], "a flow control for 16 frames"
 
 
 def test_garbage_on_the_line_does_no_harm(station: RawStation) -> None:
