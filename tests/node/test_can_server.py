@@ -121,7 +121,6 @@ def test_answers_a_functional_identify_from_its_own_address(station: RawStation,
     assert node.seen == []
 
 
-@pytest.mark.parametrize("octets", ["0742000101010000", "06420000800700", "0842000080070000", "1042000080070000", "07"])
 def test_an_answer_to_everyone_waits_a_random_time_of_up_to_50_ms(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[tuple[float, float]] = []
 
@@ -134,6 +133,7 @@ def test_an_answer_to_everyone_waits_a_random_time_of_up_to_50_ms(monkeypatch: p
     assert drawn == [(0, 0.05)]
 
 
+@pytest.mark.parametrize("octets", ["0742000101010000", "06420000800700", "0842000080070000", "1042000080070000", "07"])
 def test_answers_nothing_else_that_is_asked_of_everyone(station: RawStation, node: EchoNode, octets: str) -> None:
     station.everyone(octets)
     assert station.silence(0x21) == []
