@@ -98,6 +98,19 @@ def test_an_older_epoch_than_the_node_reported_is_refused_whatever_key_is_held(p
         plan_import(pair.south, bundle.read_bytes())
 
 
+def test_the_epoch_that_the_node_reported_is_not_older_where_no_key_is_held(pair: Pair) -> None:
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    bundle, _ = pair.export("copy")
+    pair.south.nodes.remember(pair.board.uuid, epoch=2)
+    pair.south.keys.remove(pair.board.uuid)
+    plan = plan_import(pair.south, bundle.read_bytes())
+    assert isinstance(plan, ImportPlan)
+    assert [node.decision for node in plan.nodes] == ["new"]
+
+
 def test_an_older_epoch_than_that_of_a_key_without_proof_is_refused_with_the_way_on(pair: Pair) -> None:
     """The epoch was "known here", where nothing but the word of a bundle was; once the node was reached it is clear."""
     pair.take(pair.export("copy")[0])

@@ -27,6 +27,8 @@ from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.codec import security
 from tests.bench import Board, MemoryLink, make_station, talk
 
+from .test_provision import run as provision
+
 
 def run(station: Station, board: Board, link: MemoryLink | None = None, *, rotate: bool = False) -> AgreeResult:
     with talk(board, link) as node:
@@ -405,3 +407,20 @@ def test_a_pending_key_made_before_a_rotation_became_due_does_not_end_it(station
     assert opened is not None
     assert held(station, board) == [("active", 2)]
     assert station.keys.rotation_due(board.uuid) is not None
+
+
+def test_a_forged_factory_state_takes_no_node_over(station: Station, board: Board) -> None:
+    """Identify is a hint; the datasheet that the node's signature covers shows that somebody holds it."""
+    provision(station, board)
+    station.flush()
+    station.keys.remove(board.uuid)
+    before = board.state
+
+    def as_new(_count: int, reply: bytes) -> bytes:
+        is_identify = len(reply) == 26 and reply[4:14] == board.uuid
+        return reply[:14] + b"\0" + reply[15:] if is_identify else reply
+
+    with pytest.raises(PolicyError, match="would lock out the current holder"):
+        run(station, board, MemoryLink(board, tamper=as_new))
+    assert board.state == before
+    assert held(station, board) == [], "no key is kept"
