@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -244,6 +245,57 @@ def test_a_datasheet_that_is_older_than_one_that_a_member_with_sign_wrote_is_sho
     shown = call(station.home, "nodes", "--plant").out.splitlines()
     assert shown[0].endswith("no holder, datasheet 9 by east, firmware not reported")
     assert shown[1] == "  the datasheet known here is older than west wrote"
+
+
+def test_the_doctor_looks_at_clocks_psycopg_the_last_sync_and_what_is_undecided(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (west,) = others(station, west="line")
+    now = held(station, west)
+    moment, five = now.created, timedelta(minutes=5)
+
+    def said(of: str, ahead: timedelta) -> list[tuple[str, str, str]]:
+        newest = [(of, f"{moment + ahead:%Y-%m-%dT%H:%M:%SZ}")]
+        return [(one.result, one.why, one.fix) for one in doctor._clocks(now, newest, moment)]
+
+    late = f"{moment + five + SECOND:%Y-%m-%dT%H:%M:%SZ}"
+    assert said(west.fingerprint, five) == []
+    assert said(west.fingerprint, five + SECOND) == [(
+        "warning", f"The clock is behind the newest page of west ({late}).",
+        "Set the clock of this machine, or that of west.",
+    )]  # fmt: skip
+    assert said("f" * 64, five + SECOND) == []
+    ends = now.expires - moment
+    assert said(west.fingerprint, ends)[0][2] == "Set the clock of this machine, or that of west."
+    assert said(west.fingerprint, ends + SECOND)[0][2] == "Set the clock of west."
+
+    record = station.plant.joined
+    assert record is not None
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None)
+    system: Any = SimpleNamespace(home=station.home)
+
+    def checked(**changes: Any) -> list[tuple[str, str]]:
+        station.plant.put_record(replace(record, **changes))
+        return [(one.result, one.why) for one in doctor.registry(system)]
+
+    today = datetime.now(UTC)
+    week, more = (f"{today - timedelta(days=days, seconds=-5):%Y-%m-%dT%H:%M:%SZ}" for days in (7, 8))
+    roster_line = ("ok", f"plant: roster 2 holds until {now.expires:%Y-%m-%d}.")
+    nothing = ("ok", "0 events unsent, 0 conflicts.")
+    assert checked(synced=week) == [roster_line, nothing]
+    assert checked(synced=more) == [roster_line, ("warning", f"The last sync was {more}."), nothing]
+    assert checked() == [roster_line, ("warning", "The last sync was never."), nothing]
+    assert checked(synced=week, url="file:/media/stick") == [roster_line, nothing]
+    missing = ("failed", "psycopg is missing.")
+    assert checked(synced=week, url="postgresql://office/plant") == [roster_line, missing, nothing]
+    station.plant.claims.put_conflicts({NODE: {"two keys": "x", "two holders": "y"}})
+    apply_pages.alarm(station, "junk", west.fingerprint, 3, "a page")
+    assert checked(synced=week) == [
+        roster_line, ("warning", "Alarm junk: a page."), ("warning", "1 event unsent, 1 conflict.")
+    ]  # fmt: skip
+    station.plant.alarms.see()
+    assert checked(synced=week) == [roster_line, ("warning", "1 event unsent, 1 conflict.")]
+    assert checked(left="2026-01-01T00:00:00Z") == []
 
 
 # -- what the owner of the CA key may do -------------------------------------------------------------------------------

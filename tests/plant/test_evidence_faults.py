@@ -7,14 +7,16 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, NodeRefusedError, NodeSilentError, NotAuthenticError
+from teds_provision.plant.evidence import sign_evidence
 from teds_provision.plant.verify_evidence import EvidenceAnchors
 from teds_provision.protocol.handover.strict_json import Members
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.keys import Credentials, SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.evidence import (
     BoardFacts,
@@ -28,6 +30,7 @@ from teds_provision.protocol.plant.evidence import (
     pae,
     seal,
 )
+from teds_provision.provisioning.conversation import Conversation
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.origin import ORIGIN, Origin, origin_from_text
 from tests.plant.plants import CA
@@ -250,6 +253,25 @@ def test_a_step_that_had_nothing_to_do_is_no_failure() -> None:
     good = tuple((f"step {word}", word, 1) for word in ("ok", "done", "nothing to do", "skipped"))
     assert replace(FACTS, steps=good).failure is None
     assert replace(FACTS, steps=(*good, ("agree", "node-silent", 1), ("verdict", "job", 1))).failure == "node-silent"
+
+
+@pytest.mark.parametrize("error", [None, NodeSilentError("x"), NodeRefusedError("x", reason=6)])
+def test_a_board_that_signs_wrongly_or_not_at_all_fails_a_pass_and_leaves_a_failure_without_its_word(
+    error: Exception | None,
+) -> None:
+    def asked(*_: object) -> bytes:
+        if error is not None:
+            raise error
+        return bytes(64)
+
+    node = cast("Conversation", SimpleNamespace(request_idempotent=asked))
+    credentials = cast("Credentials", SimpleNamespace(key=LINE, station_signature=certified(LINE)))
+    teds = SHOWN.encode()
+    with pytest.raises((NotAuthenticError, NodeSilentError, NodeRefusedError)):
+        sign_evidence(node, credentials, EvidenceClaim(UUID, teds, FACTS))
+    document = sign_evidence(node, credentials, EvidenceClaim(UUID, teds, BROKE), finished=AT)
+    read = codec.read(document)
+    assert (read.nonce, read.proof, read.verdict, read.finished) == (b"", b"", "failed", AT)
 
 
 def test_a_board_is_known_by_the_pins_file() -> None:
