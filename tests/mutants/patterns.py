@@ -2807,6 +2807,41 @@ PATTERNS = (
         "digest",
         "tests/test_firmware_image.py",
     ),
+    Pattern(
+        "a node that was keyed since it was found new is not taken over",
+        "_agree_anew",
+        "only_new and not agreed.unsigned",
+        "False",
+        "tests/provisioning/test_agree.py",
+    ),
+    Pattern(
+        "a datasheet that the node has after all is not committed again",
+        "_commit",
+        "_is_there(node, image)",
+        "False",
+        "tests/provisioning/test_writing.py",
+    ),
+    Pattern(
+        "a node that refuses a stored TEDS is sent all of them",
+        "_commit",
+        "refusal.reason != Reason.DIGEST_MISMATCH or not skip",
+        "True",
+        "tests/provisioning/test_writing.py",
+    ),
+    Pattern(
+        "a busy node is no silent one",
+        "_Exchange.run",
+        "answered.reply[0][1:] == _BUSY and not self._prompt",
+        "False",
+        "tests/links/can/test_station_waits.py",
+    ),
+    Pattern(
+        "no try begins after fifteen seconds",
+        "_Exchange.run",
+        "time.monotonic() - began >= self._longest",
+        "False",
+        "tests/links/can/test_station_waits.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

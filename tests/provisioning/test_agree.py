@@ -21,6 +21,7 @@ from teds_provision.protocol.messages.frames import Command, Reason, Reply, refu
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.provisioning.agree import AgreeResult, agree, open_session, require_session
+from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
@@ -424,3 +425,45 @@ def test_a_forged_factory_state_takes_no_node_over(station: Station, board: Boar
         run(station, board, MemoryLink(board, tamper=as_new))
     assert board.state == before
     assert held(station, board) == [], "no key is kept"
+
+
+class KeyedMeanwhile(MemoryLink):
+    """A link on which another station keys the board, which was new, just before the Request reaches it."""
+
+    def exchange(self, frame: bytes) -> bytes:
+        if frame[2:4] == b"\x80\x01" and self.board.state.state == NodeState.FACTORY:
+            self.board.flash.state = self.becomes
+            self.board.power_on()
+        return super().exchange(frame)
+
+
+def test_a_node_that_was_keyed_since_it_was_found_new_is_not_taken_over(station: Station, board: Board) -> None:
+    provision(station, board)
+    station.flush()
+    link = KeyedMeanwhile(board)
+    link.becomes = board.state  # type: ignore[attr-defined]
+    board.tim.reset_by_hand()
+    station.keys.remove(board.uuid)
+    with pytest.raises(PolicyError, match="would lock out the current holder"):
+        run(station, board, link)
+    assert [frame[3] for frame in link.frames if frame[2] == 0x80].count(1) == 2, "one Request more, for its new TEDS"
+    assert board.state == link.becomes  # type: ignore[attr-defined]
+    assert held(station, board) == []
+
+
+def test_the_first_open_under_a_new_key_knows_both_static_keys(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The node's one-time key is due to be neither of them."""
+    opened: list[tuple[bytes, ...]] = []
+    real = Conversation.open
+
+    def noting(self: Conversation, key: bytes, *, statics: tuple[bytes, ...] = ()) -> None:
+        opened.append(statics)
+        real(self, key, statics=statics)
+
+    monkeypatch.setattr(Conversation, "open", noting)
+    whitelist(station, board)
+    run(station, board)
+    run(station, board)
+    assert opened == [(station.point, board.key.point)] * 2
