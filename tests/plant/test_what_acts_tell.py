@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import PolicyError
 from teds_provision.handover import deny, incoming, life, outgoing, pending
 from teds_provision.protocol.handover.receipt import Receipt
 from teds_provision.protocol.keys import SoftwareKey, reset_message, verify
@@ -33,7 +34,7 @@ from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 from tests.bench import Board, make_station, talk
 from tests.plant.handing import Plant
-from tests.plant.owner import ANGLE
+from tests.plant.owner import ANGLE, alone, join, member, roster_of
 
 REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"
 KEY, OTHER = "ab" * 32, "cd" * 32
@@ -251,3 +252,44 @@ def test_a_handover_is_told_by_who_gives_and_who_takes_and_once(plant: Plant, mo
     (row,) = north.handovers.all()
     pending.undo(north, row)
     assert told(north) == []
+
+
+# -- the own role ------------------------------------------------------------------------------------------------------
+
+
+def test_without_line_no_factory_node_is_keyed_and_without_sign_no_datasheet_is_signed(tmp_path: Path) -> None:
+    made = alone(tmp_path / "alone")
+    made.unlock()
+
+    def roles(*words: str) -> None:
+        before = made.plant.roster
+        assert before is not None
+        named = member(made, "owner", *words)
+        join(made, roster_of(made, named, version=before.version + 1, previous=before.hash))
+
+    def refused(board: Board, role: str, hint: str) -> None:
+        with talk(board) as node, pytest.raises(PolicyError, match=f"does not have the role {role} in plant") as error:
+            provision(
+                made, node, lambda who: prepare(made, BuildOrder(profile=ANGLE), who.uuid),
+                operator=AcceptingOperator(), reporter=SilentReporter(),
+            )  # fmt: skip
+        assert error.value.exit_code == 6
+        assert hint in error.value.hint
+
+    keyed, factory = Board(A), Board(os.urandom(10))
+    met(made, keyed)
+    roles("keeper", "sign", "base")
+    refused(factory, "line", "Key it on a station that has this role")
+    assert made.keys.keys_of(factory.uuid) == []
+    with talk(keyed) as node:
+        agree(made, node, identify(made, node), rotate=True)  # one that it keyed before is its own
+    roles("keeper", "line", "base")
+    refused(keyed, "sign", "sign --by OFFICE")
+    roles("keeper", "line", "sign", "base")
+    with talk(factory) as node:
+        done = provision(
+            made, node, lambda who: prepare(made, BuildOrder(profile=ANGLE), who.uuid),
+            operator=AcceptingOperator(), reporter=SilentReporter(),
+        )  # fmt: skip
+    assert done.verified.verdict == "authentic"
+    made.close()
