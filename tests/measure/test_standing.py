@@ -136,3 +136,101 @@ def test_a_key_that_was_stolen_ends_a_session_that_was_opened_before_and_again_a
         with pytest.raises(KeyStolenError) if ends else nullcontext():
             standing.require()
         assert standing.ended is None, "the next session is under a new key"
+
+
+class Store:
+    """A station whose decisions and verdict on one node are the test's."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.version, self.verdict, self.listed, self.theft = 1, "authentic", True, ""
+        self.looks = 0
+        self.now = 100.0
+        self.pins = SimpleNamespace(entry=lambda _uuid: object() if self.listed else None)
+        self.keys = SimpleNamespace(stolen=lambda _uuid: self.theft or None)
+        monkeypatch.setattr(of_standing, "require_measurable", lambda *_words: None)
+        monkeypatch.setattr(of_standing, "verdict_of", self.verdict_of)
+        monkeypatch.setattr(of_standing, "time", SimpleNamespace(monotonic=lambda: self.now, time=lambda: 1.8e9))
+
+    def changes(self) -> int:
+        return self.version
+
+    def verdict_of(self, _station: Any, _uuid: bytes) -> Any:
+        self.looks += 1
+        checks = [
+            SimpleNamespace(result="failed", why="the signer is unknown", name="signer"),
+            SimpleNamespace(result="failed", why="", name="sequence"),
+            SimpleNamespace(result="passed", why="fine", name="checksums"),
+        ]
+        return SimpleNamespace(verified=SimpleNamespace(verdict=self.verdict, checks=checks))
+
+    def standing(self) -> NodeStanding:
+        station: Any = self
+        return NodeStanding(station, bytes(10))
+
+    def decide(self, standing: NodeStanding, **decided: Any) -> None:
+        """Change the store, and look a second later."""
+        for name, value in decided.items():
+            setattr(self, name, value)
+        self.version += 1
+        self.now += 1.0
+        standing.require()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "unsigned", "mark"),
+    [
+        ("authentic", False, ""),
+        ("unproven", False, "its datasheet is unproven: the signer is unknown; sequence"),
+        ("unsigned", True, ""),
+        ("unsigned", False, None),
+        ("not authentic", True, None),
+    ],
+)
+def test_a_datasheet_that_is_worse_today_ends_the_session_or_marks_its_values(
+    verdict: str, unsigned: bool, mark: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(monkeypatch)
+    standing = store.standing()
+    standing.unsigned = unsigned
+    if mark is not None:
+        store.decide(standing, verdict=verdict)
+        assert (standing.mark, standing.ended) == (mark, None)
+        store.decide(standing, verdict="authentic")
+        assert standing.mark == "", "it is proven again"
+        return
+    with pytest.raises(BadDatasheetError, match=f"is {verdict} now: the signer is unknown; sequence") as refused:
+        store.decide(standing, verdict=verdict)
+    assert "Values recorded of it since 2027-01-15T08:00:00Z do not count" in refused.value.message
+    assert standing.ended is refused.value
+
+
+def test_a_node_is_looked_at_once_for_each_change_and_twice_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(monkeypatch)
+    standing = store.standing()
+    standing.require()
+    assert store.looks == 0, "nothing was changed since the session began"
+    store.decide(standing)
+    standing.require()
+    assert store.looks == 1
+    for _ in range(8):
+        store.version += 1
+        store.now += 0.125
+        standing.require()
+    assert store.looks == 3
+
+
+def test_only_a_node_that_is_moved_has_to_stay_on_the_whitelist_and_a_known_theft_ends_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    store = Store(monkeypatch)
+    store.theft = "seen before"
+    standing = store.standing()
+    store.decide(standing, listed=False)
+    standing.drives = True
+    store.decide(standing, listed=True)
+    with pytest.raises(PolicyError, match="not on the whitelist, so its actuators are not moved"):
+        store.decide(standing, listed=False)
+    standing.drives = False
+    store.decide(standing, theft="")
+    with pytest.raises(KeyStolenError, match="gets a new key: copied"):
+        store.decide(standing, theft="copied")

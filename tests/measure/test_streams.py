@@ -8,12 +8,13 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import NodeRefusedError
+from teds_provision.errors import NodeRefusedError, NotAuthenticError
 from teds_provision.measure.blocks import InvalidValues
 from teds_provision.measure.clock import HostClock
+from teds_provision.measure.running import streams as of_streams
 from teds_provision.measure.running.streams import SILENT, NodeStreams, StreamTotals
-from teds_provision.protocol.operation.stream_commands import StreamKind
-from teds_provision.protocol.operation.subscription import Counts
+from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
+from teds_provision.protocol.operation.subscription import Counts, StreamPlan, TickBounds
 
 
 class Bus:
@@ -150,3 +151,47 @@ def test_values_that_come_before_their_channels_are_described_are_held_and_keep_
     streams._deliver(cast(Any, "on"))
     streams.new_session()
     assert (came, streams._run, streams.clock is before) == (["on"], 0, False)
+
+
+def test_a_stream_is_registered_with_its_run_which_is_newer_than_each_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runs of one number would have one key (operation.md section 3); what is under way of the old is no error."""
+    streams, registered = NodeStreams(HostClock(), lambda _block: None), list[Any]()
+    hearing = SimpleNamespace(
+        expect=lambda _node, number, _length: f"pieces {number}",
+        register=lambda node, number, heard: registered.append((node, number, heard)),
+        forget=lambda *_words: registered.append("forgotten"),
+    )
+    bus: Any = SimpleNamespace(hearing=hearing)
+    made: list[dict[str, Any]] = []
+
+    class Made:
+        def __init__(self, *_words: Any, **named: Any) -> None:
+            made.append(named)
+
+    monkeypatch.setattr(of_streams, "StreamInterpreter", Made)
+    runs = iter([1, 3, 3])
+    plans = [StreamPlan.for_channels(number, ((1, 2),), n=2, period=10**7) for number in (0, 1)]
+    replies = {plan.command().payload: plan for plan in plans}
+
+    def request(command: Any, _doing: str) -> bytes:
+        return SubscribeReply(next(runs), replies[command.payload].length, 10**9).encode()
+
+    trusted: Any = SimpleNamespace(
+        node=SimpleNamespace(request=request, message_key=bytes(32)), sheet=None, unsigned=True
+    )
+    monkeypatch.setattr(streams.clock, "ticks_at", lambda _host: TickBounds(0, 10**9))
+    before = time.monotonic()
+    streams.subscribe(bus, trusted, plans[0], 0x21, ahead=100.0)
+    first = streams.running[0]
+    assert registered == [(0x21, 0, first)]
+    assert first.last_good_at >= before + 100.0, "it is silent until its first sample, and not lost"
+    assert (first.pieces, first.receiver.run, first.receiver._before) == ("pieces 0", 1, None)
+    streams.subscribe(bus, trusted, plans[0], 0x21)
+    again = streams.running[0]
+    assert again.receiver._before is first.receiver._sealer
+    assert (again.receiver.run, registered[1:]) == (3, [(0x21, 0, again)])
+    assert [named["raw_only"] for named in made] == ["the datasheet is unsigned: raw values only"] * 2
+    with pytest.raises(NotAuthenticError, match="run 3 after run 3"):
+        streams.subscribe(bus, trusted, plans[1], 0x21)
+    assert registered[-1] == "forgotten"
+    assert list(streams.running) == [0]
