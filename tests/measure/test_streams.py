@@ -186,11 +186,13 @@ def test_a_stream_is_registered_with_its_run_which_is_newer_than_each_before(mon
     assert registered == [(0x21, 0, first)]
     assert first.last_good_at >= before + 100.0, "it is silent until its first sample, and not lost"
     assert (first.pieces, first.receiver.run, first.receiver._before) == ("pieces 0", 1, None)
+    trusted.unsigned = False
     streams.subscribe(bus, trusted, plans[0], 0x21)
     again = streams.running[0]
     assert again.receiver._before is first.receiver._sealer
     assert (again.receiver.run, registered[1:]) == (3, [(0x21, 0, again)])
-    assert [named["raw_only"] for named in made] == ["the datasheet is unsigned: raw values only"] * 2
+    assert [named["raw_only"] for named in made] == ["the datasheet is unsigned: raw values only", ""]
+    assert (streams.totals[0].channels, streams.totals[0].period) == ((1,), 0.01)
     with pytest.raises(NotAuthenticError, match="run 3 after run 3"):
         streams.subscribe(bus, trusted, plans[1], 0x21)
     assert registered[-1] == "forgotten"

@@ -2482,6 +2482,34 @@ PATTERNS = (
         "not mark",
         "tests/measure/test_trigger.py",
     ),
+    Pattern(
+        "a row has no value from after it",
+        "_fill",
+        "place[0] >= 0 and old.max() <= stream.keeps",
+        "old.max() <= stream.keeps",
+        "tests/measure/test_grid.py",
+    ),
+    Pattern(
+        "the age of a block counts from its last instant",
+        "StreamInterpreter._block",
+        "host + span * rate",
+        "host",
+        "tests/measure/test_invalid_values.py",
+    ),
+    Pattern(
+        "a value goes by command every half of the dead-man",
+        "TopicActuators._send",
+        "fast_alone and now - actuator.answered < self._dead_man / 2000",
+        "fast_alone",
+        "tests/measure/test_topic_actuators.py",
+    ),
+    Pattern(
+        "units spelled as tuples are checked for exponents",
+        "_exponents",
+        "units.interpretation in (4, 5) and units != Units(units.interpretation, extension=units.extension)",
+        "False",
+        "tests/teds/test_codec_findings.py",
+    ),
     # the draw of 65: what no test noticed
     Pattern(
         "a value goes out with its variance",

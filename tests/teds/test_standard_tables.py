@@ -492,3 +492,57 @@ def test_a_time_has_32_and_31_bits_in_2007_and_48_and_32_in_2024(
 def test_a_key_is_text_if_it_can_be_read_and_octets_else(raw: bytes, value: object) -> None:
     decoded = teds.decode(bytes([3, 4, 0, 128, 1, 1, 101, len(raw)]) + raw)
     assert decoded.get("NodePublicKey") == value
+
+
+DIRECTORY = "0304000E0101 0A0101 0B13 1402656E 150400000026 160400000006 170100 0C02FE5E"
+"""NumLang 1; LangCode en, Offset 38 (from the first octet of the TEDS), Length 6, Compress 0; SubSum."""
+
+
+def located(directory: str, text: str) -> bytes:
+    return frame(bytes.fromhex((directory + text).replace(" ", "")))
+
+
+def test_a_text_stands_bare_behind_its_directory_with_a_checksum_of_its_own() -> None:
+    whole = located(DIRECTORY, "3C612F3E FEF5")
+    assert teds.compose(14, [("Text", {"LangCode": "en", "Text": "<a/>"})]) == whole
+    decoded = teds.decode(whole)
+    assert (decoded.text, decoded.findings) == ((b"<a/>",), ())
+    assert [field.name for field in decoded.fields] == ["TEDSID", "NumLang", "DirBlock", "SubSum"]
+    assert (decoded.get("LangCode"), decoded.get("Offset"), decoded.get("Length")) == ("en", 38, 6)
+    two = teds.decode(teds.compose(2, [("Text", {"Text": "a"}), ("Text", {"LangCode": "de", "Text": "bc"})]))
+    places = [(field.children[1].value, field.children[2].value) for field in two.fields if field.name == "DirBlock"]
+    assert (two.get("NumLang"), two.text, places) == (2, (b"a", b"bc"), [(59, 3), (62, 4)])
+
+
+@pytest.mark.parametrize(
+    ("directory", "text", "found", "texts"),
+    [
+        (DIRECTORY, "3C612F3E FEF4", {"text-checksum": "warning"}, (b"<a/>",)),
+        (DIRECTORY.replace("00000006", "00000004"), "3C612F3E FEF5", {"text-length": "note"}, (b"<a/>",)),
+        (DIRECTORY.replace("00000006", "00000009"), "3C612F3E FEF5", {"text-length": "warning"}, (b"<a/>\xfe\xf5",)),
+        (DIRECTORY, "8004 3C612F3E 8102 FEF5", {"text-tagged": "warning"}, (b"<a/>",)),
+    ],
+)
+def test_other_habits_of_texts_are_read_and_named(
+    directory: str, text: str, found: dict[str, str], texts: tuple[bytes, ...]
+) -> None:
+    decoded = teds.decode(located(directory, text))
+    assert {finding.code: finding.severity for finding in decoded.findings} == found
+    assert decoded.text == texts
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ([], "A text-based TEDS has at least one Text."),
+        ([("Text", {"Text": "a"}), ("NumLang", 1)], "takes Text entries, not NumLang"),
+        ([("Text", "a")], "Text is a mapping with LangCode, Text and Compress."),
+        ([("Text", {"Text": "a", "Offset": 1})], "Text is a mapping with LangCode, Text and Compress."),
+        ([("Text", {"Text": 1})], "Text holds text or octets, Compress a number."),
+        ([("Text", {"Text": "a", "Compress": "0"})], "Text holds text or octets, Compress a number."),
+        ([("Text", {"Text": "a", "LangCode": "eng"})], "LangCode has 2 octets, not 3."),
+    ],
+)
+def test_a_text_that_cannot_be_written_is_refused_by_name(fields: list[tuple[str, object]], words: str) -> None:
+    with pytest.raises(BadDataError, match=words):
+        teds.compose(14, fields)
