@@ -355,7 +355,9 @@ def test_which_upload_is_carried_on_and_which_begins_anew() -> None:
     assert desk.ask(smp.UPLOAD, first_piece(NEW, 300)) == {"off": 800}, "the same image"
     assert desk.ask(smp.UPLOAD, first_piece(NEW, 300, len=len(NEW) - 1)) == {"off": 300}, "another length"
     desk.now += 10
-    assert desk.ask(smp.UPLOAD, first_piece(NEW, 200, sha=bytes(32))) == {"off": 200}, "another digest"
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 200, sha=bytes(32))) == {"off": 200}, "both"
+    desk.now += 10
+    assert desk.ask(smp.UPLOAD, first_piece(NEW, 150, sha=bytes(31) + b"\1")) == {"off": 150}, "another digest"
     desk.now += 10
     for octets in (400, 100):
         assert desk.ask(smp.UPLOAD, first_piece(NEW, octets, sha=None)) == {"off": octets}, "without one: always"

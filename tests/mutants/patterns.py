@@ -2870,6 +2870,34 @@ PATTERNS = (
         "False",
         "tests/links/can/test_station_waits.py",
     ),
+    Pattern(
+        "a lower build is an older version too",
+        "_Look._look",
+        "(*report.version, report.build)",
+        "(*report.version, 0)",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "a claim of a sensor keeps no update out",
+        "require_free_actuators",
+        "state & ChannelState.ACTUATOR and state & claims",
+        "state & claims",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "a plan with nothing to do interrupts nothing",
+        "_Look.planned",
+        '() if holder is None or stage == "nothing" else (holder,)',
+        "() if holder is None else (holder,)",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "an update that goes on later is not logged as ended",
+        "_Update.run",
+        "isinstance(error, LinkClosedError) or (error is not None and self._is_ending())",
+        "isinstance(error, LinkClosedError)",
+        "tests/provisioning/test_update.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

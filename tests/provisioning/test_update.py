@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,23 +17,27 @@ import pytest
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
+    LinkClosedError,
     NodeRefusedError,
     NodeSilentError,
     NotAuthenticError,
     PolicyError,
     RevertedError,
+    StoreError,
     WrongImageError,
 )
+from teds_provision.firmware_image import FirmwareImage
 from teds_provision.links import LinkSettings
 from teds_provision.node import virtual
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
 from teds_provision.provisioning import image_manager, update
 from teds_provision.provisioning.agree import reset_node
-from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.identify import identify
-from teds_provision.provisioning.image_manager import ImageManager
+from teds_provision.provisioning.image_manager import BoardImage, ImageManager
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.update import UpdateOrder, plan_update, update_at
 from teds_provision.station.firmware import firmware_of
@@ -659,3 +663,190 @@ def test_the_time_of_one_trial_ends_no_later_one(
     assert (restarts, slots.on_trial) == ([], True)
     third.work()
     assert (restarts, slots.on_trial) == (["1.0.0"], False)
+
+
+# -- what a look at a board decides ------------------------------------------------------------------------------------
+
+RUNS, NEWER = bytes([1]) * 32, bytes([2]) * 32
+
+
+@pytest.mark.parametrize(
+    ("state", "refused"),
+    [(1, False), (1 | 2, True), (1 | 4, True), (2, False), (4, False), (1 | 16 | 32, False)],
+    ids=["free", "claimed here", "claimed by another", "a sensor here", "a sensor by another", "stopped"],
+)
+def test_only_a_claimed_actuator_keeps_an_update_out(state: int, refused: bool) -> None:
+    node: Any = SimpleNamespace(request_idempotent=lambda _command, _doing: bytes([1, 1, 0, 0, 7, state, 0xF2]))
+    if not refused:
+        update.require_free_actuators(node)
+        return
+    with pytest.raises(PolicyError, match="Actuator 7 of the board is in use"):
+        update.require_free_actuators(node)
+
+
+def look_at(
+    monkeypatch: pytest.MonkeyPatch, image: Any, report: FirmwareReport, *, images: Any = (), **order: bool
+) -> tuple[Any, list[str]]:
+    """Return what an update of such a board would do, and whose actuators were asked for."""
+    asked: list[str] = []
+    monkeypatch.setattr(update, "read_about", lambda _node: report)
+    monkeypatch.setattr(update, "require_free_actuators", lambda _node: asked.append("actuators"))
+    monkeypatch.setattr(update, "ImageManager", lambda _node: SimpleNamespace(images=lambda: list(images)))
+    station: Any = SimpleNamespace(measurements=SimpleNamespace(holder=lambda _uuid: "crane"))
+    link = SimpleNamespace(capabilities=SimpleNamespace(octets_a_second=500))
+    node: Any = SimpleNamespace(contact=SimpleNamespace(link=link))
+    return update._Look(station, bytes(10), UpdateOrder(image, **order)).planned(node), asked
+
+
+def image_of(digest: bytes, version: tuple[int, int, int, int] = (1, 2, 3, 45), board: str | None = "b/app") -> Any:
+    return FirmwareImage(bytes(1000), version, digest, board, None, 32)
+
+
+def reported(digest: bytes = RUNS, *flags: FirmwareFlag, build: int = 44) -> FirmwareReport:
+    whole = FirmwareFlag.MANAGE
+    for flag in flags:
+        whole |= flag
+    return FirmwareReport("b/app", (1, 2, 3), build, digest, whole)
+
+
+@pytest.mark.parametrize(
+    ("digest", "flag", "stage", "octets", "seconds", "interrupts", "actuators"),
+    [
+        (RUNS, None, "upload", 1000, 2.0, ("crane",), ["actuators"]),
+        (RUNS, FirmwareFlag.PENDING, "restart", 0, 0.0, ("crane",), ["actuators"]),
+        (NEWER, FirmwareFlag.ON_TRIAL, "prove", 0, 0.0, ("crane",), []),
+        (NEWER, None, "nothing", 0, 0.0, (), []),
+    ],
+    ids=["upload", "restart", "prove", "nothing"],
+)
+def test_what_a_plan_says_of_each_first_step(
+    digest: bytes,
+    flag: FirmwareFlag | None,
+    stage: str,
+    octets: int,
+    seconds: float,
+    interrupts: tuple[str, ...],
+    actuators: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    report = reported(digest, *([] if flag is None else [flag]))
+    images = [BoardImage(NEWER, running=False, confirmed=False, pending=True)]
+    for board, question in (
+        ("b/app", ""),
+        ("b", ""),
+        ("c", "The image names the board 'c'; this board is 'b/app'."),
+        (None, "The image does not name its board; this board is 'b/app'."),
+    ):
+        plan, asked = look_at(monkeypatch, image_of(NEWER, board=board), report, images=images)
+        assert (plan.stage, plan.octets, plan.seconds, plan.interrupts) == (stage, octets, seconds, interrupts)
+        assert plan.question == ("" if stage == "nothing" else question)
+        assert asked == actuators
+
+
+@pytest.mark.parametrize(
+    ("version", "older"),
+    [
+        ((1, 2, 3, 44), False),
+        ((1, 2, 3, 45), False),
+        ((1, 2, 3, 43), True),
+        ((1, 2, 2, 99), True),
+        ((0, 9, 9, 9), True),
+    ],
+)
+def test_a_lower_build_is_an_older_version_too(
+    version: tuple[int, int, int, int], older: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = image_of(NEWER, version)
+    if older:
+        with pytest.raises(DowngradeError):
+            look_at(monkeypatch, image, reported())
+    assert look_at(monkeypatch, image, reported(), allow_downgrade=older)[0].stage == "upload"
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        [],
+        [BoardImage(NEWER, running=False, confirmed=False, pending=False)],
+        [BoardImage(RUNS, running=False, confirmed=False, pending=True)],
+        [
+            BoardImage(NEWER, running=False, confirmed=False, pending=False),
+            BoardImage(RUNS, running=True, confirmed=True, pending=True),
+        ],
+    ],
+    ids=["none", "it is there and does not start", "another one starts", "another one than the one that is there"],
+)
+def test_only_the_very_image_that_starts_next_is_gone_on_with(
+    images: list[BoardImage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(PolicyError, match="Another image starts at the next restart"):
+        look_at(monkeypatch, image_of(NEWER), reported(RUNS, FirmwareFlag.PENDING), images=images)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "result", "logged"),
+    [
+        ("updated", "updated", True),
+        ("already", "already", False),
+        (RevertedError("It was reverted."), "reverted", True),
+        (PolicyError("It is refused."), "refused", True),
+        (SessionLostError(NodeSilentError("It is silent.")), "lost", True),
+        (LinkClosedError("The bus was closed."), "lost", False),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("ending", [False, True])
+def test_how_an_update_ends_is_in_the_log_unless_it_goes_on_later(
+    outcome: Any, result: str, logged: bool, ending: bool
+) -> None:
+    """A log that cannot be written hides nothing."""
+    log: list[tuple[object, ...]] = []
+
+    def audit(*words: object, **facts: object) -> None:
+        log.append((*words, facts["to"], facts.get("why")))
+        raise StoreError("The disk is full.")
+
+    def run(*, released: bool) -> Any:
+        assert released
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    none: Any = None
+    station: Any = SimpleNamespace(
+        node_lock=lambda _uuid: nullcontext(), released=lambda _uuid, _why: nullcontext(True), audit=audit
+    )
+    made = update._Update(
+        station, none, 1.0, bytes(10), UpdateOrder(image_of(NEWER)), SilentReporter(), None, lambda: ending
+    )
+    made._run = run  # type: ignore[method-assign,assignment]
+    done = made.run()
+    assert done.result == result
+    cause = getattr(outcome, "cause", outcome)
+    assert done.error is (cause if isinstance(outcome, Exception) else None)
+    why = getattr(cause, "message", None)
+    due = logged and not (ending and done.error is not None)
+    assert log == ([("update", bytes(10), result, "1.2.3+45", why)] if due else [])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "same"),
+    [
+        (5, 5, True),
+        (5, 6, True),
+        (5, 5 + 2**32 - 1, True),
+        (5, 5 + 2**32, False),
+        (5, 4, False),
+        (2**64 - 1, 0, True),
+        (2**64 - 1, 2**32, False),
+        (None, 5, False),
+        (5, None, False),
+    ],
+)
+def test_a_board_has_restarted_if_c_of_open_moved_by_2_to_the_32_or_more(
+    before: int | None, after: int | None, same: bool
+) -> None:
+    def octets(c: int | None) -> bytes | None:
+        return None if c is None else c.to_bytes(8, "big")
+
+    assert update._same_power_up(octets(before), octets(after)) is same
