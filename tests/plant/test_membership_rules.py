@@ -12,14 +12,16 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError, RosterExpiredError
+from teds_provision.handover import trust
 from teds_provision.plant import membership
 from teds_provision.plant.membership import accept, branch, disconnect, found_roster, request, vouch
 from teds_provision.plant.transport import CarriedPage, Transport
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.protocol.plant.page import PageDraft, open_page, sign_page
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.owner import ALL, REGISTRY, alone, join, member, roster_of
 from tests.plant.plants import NOW
 from tests.plant.test_contract_states import H, held, others, paged
@@ -239,3 +241,58 @@ def test_who_has_one_history_is_not_accepted(station: Station) -> None:
     for of in (west.fingerprint, gone.fingerprint):
         with pytest.raises(NotFoundError, match="has only one history here"):
             branch(station, of, None, None)
+
+
+# -- what the roster decides alone, and what a dispute holds back ------------------------------------------------------
+
+
+def test_trust_in_a_key_that_the_roster_names_is_the_rosters(station: Station, tmp_path: Path) -> None:
+    (west,) = others(station, west="line")
+    gone = RemovedMember("gone", SoftwareKey(7000).point, frozenset({"line"}), "lost", (0, ""))
+    held(station, west, removed=(gone,))
+    for name, point in (("west", west.point), ("gone", gone.point), ("stranger", SoftwareKey(8000).point)):
+        (tmp_path / f"{name}.pem").write_text(to_pem(point))
+    for name in ("west", "gone"):
+        with pytest.raises(PolicyError, match="is decided by the plant's roster") as error:
+            trust.add(station, [trust.candidate(station, name, tmp_path / f"{name}.pem", "station")])
+        assert error.value.exit_code == 6
+    assert trust.add(station, [trust.candidate(station, "stranger", tmp_path / "stranger.pem", "station")]) == 1
+    listed = {record.name: record for record in station.policy.listed()}
+    assert set(listed) == {"west", "stranger"}, "members, and what was added; whom it removed is not trusted"
+    with pytest.raises(PolicyError, match="is decided by the plant's roster"):
+        trust.remove(station, listed["west"])
+    trust.remove(station, listed["stranger"])
+    assert [record.name for record in station.policy.listed()] == ["west"]
+
+
+@pytest.mark.parametrize(
+    ("conflict", "entry", "holds", "held_back"),
+    [
+        ("two keys", None, False, True),
+        ("two holders", None, False, False),
+        ("other pin", None, False, False),
+        ("two keys", (H, "uuid"), False, False),
+        ("two keys", (H, "tap"), False, False),
+        ("two keys", (H, "registry"), False, True),
+        ("two keys", (None, "uuid"), False, True),
+        ("two keys", None, True, False),  # who has its key goes on
+    ],
+)
+def test_two_keys_of_a_node_hold_back_who_would_key_it_for_the_first_time(
+    station: Station, conflict: str, entry: tuple[str | None, Any] | None, holds: bool, held_back: bool
+) -> None:
+    if entry is not None:
+        station.pins.put(WhitelistEntry(UUID, entry[0], assurance=entry[1]))
+    if holds:
+        station.keys.add_pending(UUID, key=bytes(16), key_id=bytes(8), epoch=1)
+    station.plant.claims.put_conflicts({UUID: {conflict: "north and west name two keys"}})
+    station.policy.require_undisputed(bytes(10))
+    if not held_back:
+        station.policy.require_undisputed(UUID)
+        return
+    with pytest.raises(PolicyError, match="north and west name two keys") as error:
+        station.policy.require_undisputed(UUID)
+    assert (error.value.exit_code, error.value.code) == (6, "conflict")
+    assert f"whitelist add {UUID.hex()} --fingerprint F" in error.value.hint
+    disconnect(station)
+    station.policy.require_undisputed(UUID)
