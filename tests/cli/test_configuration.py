@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,8 @@ import click
 import pytest
 
 from teds_provision.cli.config_file import Defaults, anchored, brokers_of
-from teds_provision.cli.main import cli
+from teds_provision.cli.main import cli, run
+from teds_provision.cli.station.config import _edited
 
 from .shell import call, clean_environment
 
@@ -184,6 +188,78 @@ def test_a_setting_is_written_beside_the_others_and_removed_again(home: Path) ->
     file.write_text(file.read_text().replace("\n[whitelist.add]\n", "").replace("\n[ncap.brokers]\n", ""))
     assert file.read_text() == before.replace("can9", "can0#1")
     assert call(home, "--json", "config", "unset", "provision.via").json["removed"] is None
+
+
+WRITTEN = """\
+# at the bench
+can = "socketcan:can1" # the left one
+
+[provision]
+# over the bus
+via = "nfc"
+yes = true
+
+[whitelist.add]
+dry-run = true
+"""
+
+
+def test_what_each_change_says_and_the_whole_file_after_it(home: Path) -> None:
+    file = home / "config.toml"
+    assert call(home, "config", "set", "can", "socketcan:can0").out == 'Set can = "socketcan:can0"\n'
+    assert file.read_text() == 'can = "socketcan:can0"\n'
+    file.write_text('# at the bench\ncan = "socketcan:can0" # the left one\n')
+    for words, text in (
+        ("set can socketcan:can1", 'Set can = "socketcan:can1"'),
+        ("set can socketcan:can1", 'Nothing to do: can = "socketcan:can1"'),
+        ("set provision.via nfc", 'Set provision.via = "nfc"'),
+        ("set whitelist.add.dry-run true", "Set whitelist.add.dry-run = true"),
+        ("set provision.yes true", "Set provision.yes = true"),
+        ("unset nfc", "Nothing to do: nfc is not set in config.toml."),
+    ):
+        done = call(home, "config", *words.split())
+        assert (done.code, done.out) == (0, f"{text}\n"), words
+    assert file.read_text() == WRITTEN.replace("# over the bus\n", "")
+    file.write_text(WRITTEN)
+    assert call(home, "config", "unset", "provision.yes").out == "Removed provision.yes.\n"
+    assert call(home, "--json", "config", "unset", "provision.yes").json == {"settings": [], "removed": None}
+    assert file.read_text() == WRITTEN.replace("yes = true\n", "")
+    assert call(home, "--json", "config", "set", "provision.yes", "true").json == {
+        "settings": [{"name": "provision.yes", "value": True, "source": str(file)}]
+    }
+    assert file.read_text() == WRITTEN, "behind the last setting of its table"
+
+
+def test_a_line_is_put_where_a_person_would_put_it() -> None:
+    for text, table, key, value, after in (
+        ("", "", "can", "x", 'can = "x"\n'),
+        ("", "provision", "via", "can", '[provision]\nvia = "can"\n'),
+        ("can = 1\n", "provision", "via", "can", 'can = 1\n\n[provision]\nvia = "can"\n'),
+        ("# head\n# more\n\n[log]\nlast = 5\n", "", "can", "x", '# head\n# more\ncan = "x"\n\n[log]\nlast = 5\n'),
+        ("[x]\nrate = 5\n# to\n\n[verify]\n", "x", "kind", 1, "[x]\nrate = 5\nkind = 1\n# to\n\n[verify]\n"),
+        ("[x]\n# none\n[verify]\nyes = true\n", "x", "kind", 1, "[x]\nkind = 1\n# none\n[verify]\nyes = true\n"),
+        ('can = "a#b" # c#d\n', "", "can", "y", 'can = "y" # c#d\n'),
+        ("can = 1\n[x]\ncan = 2\n", "x", "can", None, "can = 1\n[x]\n"),
+        ("can = 1\n[x]\ncan = 2\n", "", "can", None, "[x]\ncan = 2\n"),
+        ("[x]\ncan = 2\n", "", "can", None, "[x]\ncan = 2\n"),
+        ("[x]\nno_scalars = true\n", "x", "no-scalars", False, "[x]\nno_scalars = false\n"),
+    ):  # fmt: skip
+        assert _edited(text, table.split(), key, value) == after, (text, table, key)
+
+
+def test_where_the_home_was_named(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for variable in (None, str(home)):
+        with monkeypatch.context() as patch:
+            if variable is not None:
+                patch.setenv("TEDS_PROVISION_HOME", variable)
+            (found,) = call(home, "--json", "config", "show").json["settings"]
+            assert found == {"name": "home", "value": str(home), "source": "--home"}, "the command line goes first"
+    monkeypatch.setenv("TEDS_PROVISION_HOME", str(home))
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert run(["--json", "config", "show"]) == 0
+    (found,) = json.loads(out.getvalue())["settings"]
+    assert found == {"name": "home", "value": str(home), "source": "environment (TEDS_PROVISION_HOME)"}
 
 
 @pytest.mark.parametrize(
