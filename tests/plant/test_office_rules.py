@@ -143,39 +143,32 @@ def test_an_office_gives_the_unit_above_the_greatest(desk: Desk) -> None:
     assert [row.unit for row in line.units(request.job)] == [7, 8]
 
 
-@pytest.mark.parametrize(
-    ("attempts", "builds_too", "answers"), [(15, False, True), (16, False, False), (16, True, True)]
-)
-def test_after_a_restore_the_answers_of_a_unit_are_those_that_its_pages_have(
-    desk: Desk, attempts: int, builds_too: bool, answers: bool
-) -> None:
+def test_after_a_restore_the_answers_of_a_unit_are_those_that_its_pages_have(desk: Desk) -> None:
     """Of an office that is a line of the job as well, attempts are its own boards'."""
     board = make_board(1)
-    stations = {desk.line.fingerprint: 1, **({desk.office.fingerprint: 1} if builds_too else {})}
-    request = asked_for(desk, desk.request(desk.run(), board), board, stations=stations)
-    with desk.office.transaction():
-        row = UnitRow(request.job, board.uuid, 1, "2026-01-31T12:00:00Z", attempts=attempts)
-        desk.office.plant.line.put_unit(row)
-    reply = desk.asks(request)
-    assert (bool(reply.security), reply.why) == (answers, "" if answers else "the unit already has 16 answers")
+    good = desk.request(desk.run(), board)
+    for attempts, builds_too, answers in ((15, False, True), (16, False, False), (16, True, True)):
+        stations = {desk.line.fingerprint: 1, **({desk.office.fingerprint: 1} if builds_too else {})}
+        request = asked_for(desk, good, board, stations=stations)
+        with desk.office.transaction():
+            row = UnitRow(request.job, board.uuid, 1, "2026-01-31T12:00:00Z", attempts=attempts)
+            desk.office.plant.line.put_unit(row)
+        reply = desk.asks(request)
+        assert (bool(reply.security), reply.why) == (answers, "" if answers else "the unit already has 16 answers")
 
 
-@pytest.mark.parametrize(
-    ("own", "asked", "sequence"),
-    [(0, 0, 1), (9, 3, 10), (3, 9, 10), (9, 9, 10), (4, 65_539, 65_540), (4, 65_540, None), (0, 65_535, 65_536)],
-)
-def test_a_sequence_is_one_more_than_the_greater_and_jumps_at_most_65535(
-    desk: Desk, own: int, asked: int, sequence: int | None
-) -> None:
-    board = make_board(1)
-    request = proven(desk.request(desk.run(), board), desk.line, board, sequence=asked)
-    desk.office.nodes.remember(board.uuid, sequence=own)
-    reply = desk.asks(request)
-    if sequence is None:
-        assert (reply.refused, desk.office.plant.line.units(request.job)) == ("sequence", [])
-        reply = desk.asks(request, jump=True)
-        sequence = asked + 1
-    assert (reply.refused, reply.sequence) == ("", sequence)
+def test_a_sequence_is_one_more_than_the_greater_and_jumps_at_most_65535(desk: Desk) -> None:
+    run = desk.run(count=9, stations={desk.line.fingerprint: 9})
+    cases = [(0, 0, 1), (9, 3, 10), (3, 9, 10), (4, 65_539, 65_540), (4, 65_540, None), (0, 65_535, 65_536)]
+    for number, (own, asked, sequence) in enumerate(cases):
+        board = make_board(number)
+        request = proven(desk.request(run, board), desk.line, board, sequence=asked)
+        desk.office.nodes.remember(board.uuid, sequence=own)
+        reply = desk.asks(request)
+        if sequence is None:
+            assert (reply.refused, desk.office.plant.line.unit(request.job, board.uuid)) == ("sequence", None)
+            reply = desk.asks(request, jump=True)
+        assert (reply.refused, reply.sequence) == ("", sequence or asked + 1), (own, asked)
 
 
 def test_a_request_of_more_than_a_day_ahead_gets_no_answer_yet(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
