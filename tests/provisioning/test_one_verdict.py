@@ -90,7 +90,7 @@ def test_what_a_board_says_plainly_does_not_replace_what_its_datasheet_said(
     assert before is not None
     for one, channels, name in ((board, before.channels, before.name), (stranger, 9, "impostor")):
         with talk(one) as node:
-            identify_module._identified(station, node, add=False)
+            identify_module._identified(station, node, add=False, dry_run=False)
         known = station.nodes.get(one.uuid)
         assert known is not None
         assert (known.channels, known.name) == (channels, name)
