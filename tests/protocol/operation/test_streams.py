@@ -113,6 +113,16 @@ def test_a_new_subscribe_ends_the_run_before_and_a_refused_one_does_not() -> Non
 # -- sending -----------------------------------------------------------------------------------------------------------
 
 
+def test_the_segments_of_a_long_message_count_from_1_to_7_and_round() -> None:
+    bench = Bench().open().operate(1)
+    consumer = Consumer(bench, n=113, period=1 * MS, start=100 * MS)
+    bench.until(300 * MS)
+    segments = [frame.identifier >> 8 & 7 for _, frame in bench.frames]
+    assert segments == [0, *(k % 7 + 1 for k in range(29))], "239 octets in 30 frames"
+    (message,) = consumer.messages()
+    assert values(message) == list(range(100, 213))
+
+
 @pytest.mark.parametrize("gaps", [(300, 700), (700, 300)])
 def test_frames_leave_at_least_the_largest_gap_apart(gaps: tuple[int, int]) -> None:
     bench = Bench().open().operate(1, 2)
