@@ -180,6 +180,8 @@ def station_of(**more: Any) -> Any:
         ("name:arm-*", ARM, ""),
         ("name:ARM-*", ARM, "its name 'arm-1' is not ARM-*"),
         ("name:*,name:leg", ARM, "its name 'arm-1' is not leg"),
+        ("name:leg,name:*", ARM, "its name 'arm-1' is not leg"),
+        ("name:arm-*,name:*-1", ARM, ""),
         ("name:*", BARE, ""),
         ("name:?*", BARE, "its name '' is not ?*"),
         ("left", ARM, ""),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import http.client
 import json
 import os
 import socket
@@ -10,6 +11,7 @@ import stat
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -306,8 +308,17 @@ def test_the_login_works_once_and_leaves_a_cookie_that_scripts_cannot_read(servi
     assert service.raw("GET", path).status == 401, "the token of the URL works once"
     mine = {"Cookie": cookie.partition(";")[0], "Sec-Fetch-Site": "same-origin"}
     assert service.raw("GET", "/api/v1/status", mine).json["write"] is True
+    for path in (f"/api/v1/nodes/{'00' * 10}/let-go", "/api/v1/lend"):
+        assert status_of(service, path, mine) == 422, "only a command of this user takes a node or a reader"
     stranger = {**mine, "Origin": "http://evil.example"}
     assert service.raw("PUT", "/api/v1/detection", {**stranger, **JSON}, '{"mode": "transparent"}').status == 403
+
+
+def status_of(service: Service, path: str, headers: dict[str, str]) -> int:
+    """Return the status of an answer, whose body may have no end."""
+    with closing(http.client.HTTPConnection("127.0.0.1", service.port, timeout=PATIENCE)) as connection:
+        connection.request("GET", path, headers=headers)
+        return connection.getresponse().status
 
 
 def websocket(service: Service, headers: dict[str, str], origin: str | None = None) -> Any:

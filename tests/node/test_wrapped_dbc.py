@@ -473,6 +473,26 @@ def test_another_message_that_overlaps_itself_does_not_hinder_and_its_own_does(t
         dbc_message.read(path, "Bad")
 
 
+@pytest.mark.parametrize(
+    ("identifier", "clashes"),
+    [
+        (0x18DA05F4, True),  # requests and replies of a node
+        (0x1CDB00F4, True),  # a question to all nodes
+        (0x0CEF05F4, True),  # set points
+        (0x1CFF2021, True),  # an Announce
+        (0x18FFFF21, True),
+        (0x18FE6E21, False),
+        (0x18EE0521, False),
+        (0x18F00421, False),
+    ],
+)
+def test_a_message_whose_group_is_one_of_the_nodes_own_is_named(tmp_path: Path, identifier: int, clashes: bool) -> None:
+    path = tmp_path / "two.dbc"
+    signal = ' SG_ x : 0|16@1+ (1,0) [0|0] "" A\n'
+    path.write_text(f"{HEAD}BO_ 100 One: 8 A\n{signal}\nBO_ {identifier | 1 << 31} Other: 8 A\n{signal}\n")
+    assert dbc_message.read(path, "One").clashing == (("Other",) if clashes else ())
+
+
 @pytest.mark.parametrize("text", ["a", '\\"'])
 def test_a_text_without_end_takes_no_memory(tmp_path: Path, text: str) -> None:
     """cantools takes 220 octets for each character of it: a gigabyte for a file of 5 MB."""

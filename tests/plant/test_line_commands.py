@@ -14,6 +14,7 @@ from teds_provision.protocol.keys import to_pem
 from teds_provision.station.station import Station as InMemory
 from teds_provision.station.station import initialise
 from tests.bench import PASSPHRASE
+from tests.cli.shell import set_passphrase
 from tests.e2e.desk import PROGRAM, Desk, Links, Station
 from tests.places import free_reader
 from tests.vault.softhsm import PIN, loaded, unload
@@ -294,6 +295,20 @@ def test_an_office_follows_the_registry_to_another_place(
     office.wait_for(node.uuid)
     office.signal(15)
     assert office.end().code == 0
+
+
+def test_an_office_ends_when_passphrase_and_master_key_were_changed(owner: Station, tmp_path: Path) -> None:
+    """It cannot open the vault again: it signs nothing more by the key that it holds, and ends with 7."""
+    job, stick = new_job(owner, "--count", 1), tmp_path / "stick"
+    stick.mkdir()
+    office = owner.start("signer", "run", "--job", job["id"], "--files", stick)
+    office.wait_for("Signing for 1 job")
+    old, owner.passphrase = owner.passphrase, "a new one for all"
+    assert old is not None
+    assert set_passphrase(owner.home, old, owner.passphrase).code == 0
+    owner.run("vault", "rewrap")
+    outcome = office.end()
+    assert (outcome.code, "changed" in outcome.err) == (7, True), outcome
 
 
 def test_an_office_waits_while_its_folder_or_registry_is_out_of_reach(

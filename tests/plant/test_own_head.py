@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.errors import ForkError, LinkError, PolicyError
+from teds_provision.errors import ForkError, LinkError, NotAuthenticError, PolicyError
 from teds_provision.plant.apply_pages import alarm
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import SyncResult, acknowledge, own_chain, resume, sync
@@ -102,6 +102,26 @@ class ReadOnlyRegistry(Registry):
 
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
         raise LinkError("The connection broke.")
+
+
+@pytest.mark.parametrize("genuine", [0, 2])
+def test_a_page_under_ones_own_name_that_ones_key_did_not_sign_stops_all(west: West, genuine: int) -> None:
+    """Also beside genuine pages that come with it: nothing is pushed until a person has deleted it there."""
+    for _ in range(genuine):
+        west.page()
+    copy = west.copy(restored=False)
+    west.page()
+    west.page()
+    number = genuine + 3
+    west.file(number).write_bytes(west.file(number - 1).read_bytes()[:-4] + b"AAAA")
+    west.write(copy)
+    kept = sorted(file.name for file in west.file(1).parent.iterdir())
+    with pytest.raises(NotAuthenticError) as stopped:
+        west.sync(copy)
+    assert f"from number {number} on" in stopped.value.message
+    assert f"registry sql --mend west {number}" in stopped.value.hint
+    assert alarms(copy) == ["junk"]
+    assert sorted(file.name for file in west.file(1).parent.iterdir()) == kept
 
 
 def test_a_registry_that_forgot_pages_is_refilled_and_that_is_an_alarm(west: West) -> None:

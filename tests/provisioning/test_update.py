@@ -519,6 +519,17 @@ def test_a_board_that_answers_nonsense_ends_the_update_soon(bench: UpdateBench, 
     assert bench.runs == ("1.0.0", False, False)
 
 
+@pytest.mark.parametrize("more", [1, 10**6])
+def test_a_board_that_has_more_octets_than_were_sent_has_not_taken_the_image(
+    bench: UpdateBench, owner: Owner, more: int
+) -> None:
+    length = len(owner.long.octets)
+    HostileManager(bench, reply_with(off=length + more))
+    done = bench.update(owner.long)
+    assert isinstance(done.error, NotAuthenticError)
+    assert done.error.message == (f"The board reports {length + more} of {length} octets received, which cannot be.")
+
+
 @pytest.mark.parametrize("octet", [3, 12, -1])
 def test_a_bus_that_alters_replies_decides_nothing(owner: Owner, tmp_path: Path, octet: int) -> None:
     """Each seventh exchange has one octet of its reply changed; what is sealed then opens no more."""
