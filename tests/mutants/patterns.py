@@ -2898,6 +2898,35 @@ PATTERNS = (
         "isinstance(error, LinkClosedError)",
         "tests/provisioning/test_update.py",
     ),
+    # a stranger's draw from the contract
+    Pattern(
+        "a measured node is let go over the socket alone",
+        "Resources.lend_until_closed",
+        'caller.kind != "socket"',
+        'caller.kind == "script"',
+        "tests/ncap/test_guard.py",
+    ),
+    Pattern(
+        "junk under one's own name stops a sync also beside genuine pages",
+        "_own_pages",
+        "junk and not transport.carries_all",
+        "junk and not found and not transport.carries_all",
+        "tests/plant/test_own_head.py",
+    ),
+    Pattern(
+        "no board has more of an image than was sent",
+        "ImageManager._upload_once",
+        "not 0 <= after <= length",
+        "after < 0",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "every name of an expression must match",
+        "NodeMatch.why_not",
+        "self.names",
+        "self.names[-1:]",
+        "tests/measure/test_matching.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"
