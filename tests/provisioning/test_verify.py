@@ -27,6 +27,7 @@ from teds_provision.provisioning.sign import SignOrder, known_node_keys, sign, s
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import (
     FreshnessFloor,
+    _meta,
     freshness_floor_of,
     possession_check,
     require_authentic,
@@ -519,3 +520,18 @@ def test_a_challenge_is_a_check_and_a_lost_link_is_none() -> None:
     )
     with pytest.raises(NodeSilentError):
         possession_check(lambda: fail(NodeSilentError("gone")))
+
+
+def test_every_meta_teds_names_the_node_on_whatever_channel() -> None:
+    uuid = bytes.fromhex("8d4d9da65281f7000000")
+    own, other = (
+        frame(bytes.fromhex("030400010101040a") + named + bytes.fromhex("0a043f800000")) for named in (uuid, bytes(10))
+    )
+    for blocks, result in (
+        ({(0, 1): own}, "passed"),
+        ({(0, 1): own, (1, 1): other}, "failed"),
+        ({(0, 1): other, (1, 1): own}, "failed"),
+        ({(1, 12): other}, "passed"),
+    ):
+        checks = {check.name: check.result for check in [_meta(Image(uuid, blocks))]}
+        assert checks == {"UUID": result}
