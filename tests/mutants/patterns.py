@@ -3187,4 +3187,11 @@ C_PATTERNS = (
         "(void)session; {",
         "tests/firmware/test_manage.py",
     ),
+    CPattern(
+        "the end of a silent session is due",
+        "node.c",
+        "teds_sooner(&next, teds_sessions_poll(node, now));",
+        "(void)teds_sessions_poll(node, now);",
+        _C_TESTS,
+    ),
 )

@@ -760,6 +760,23 @@ static void what_waits_to_leave_is_due_now(void)
     memory_free(board);
 }
 
+/* The end of a silent session is due ten minutes after its last good frame: what it staged or claimed ends with it. */
+static void the_end_of_a_session_is_due(void)
+{
+    memory_board *board = fresh();
+    memory_at(board, now);
+    CHECK(memory_poll(board) == UINT64_MAX, "nothing is due");
+    has_session(board, 0, 0xF1);
+    CHECK(memory_poll(board) == now + 600000 * MS, "ten minutes");
+    now += 599999 * MS;
+    memory_at(board, now);
+    CHECK(memory_poll(board) == now + MS && board->node.sessions[0].used, "it lives");
+    now += MS;
+    memory_at(board, now);
+    CHECK(memory_poll(board) == UINT64_MAX && !board->node.sessions[0].used, "it has ended");
+    memory_free(board);
+}
+
 /* One spare line is that of a long request that comes in, the other's answer has just begun: a station without a line is
  * refused, not ignored. */
 static void a_station_without_a_line_is_refused(void)
@@ -1120,6 +1137,7 @@ int main(void)
     an_answer_to_everyone_gives_way();
     what_strangers_ask_takes_no_place_of_a_session();
     what_waits_to_leave_is_due_now();
+    the_end_of_a_session_is_due();
     a_station_without_a_line_is_refused();
     one_station_does_not_hold_the_place_of_long_requests();
     a_reply_that_is_another_link_s_is_nobodys();
