@@ -49,7 +49,7 @@ def test_one_node_of_the_bus_is_met_by_its_address(station: Station, bus: list[N
     spec = f"{station.desk.links.can}&node={address:#04x}"
     found = station.ask("identify", "--via", "can", "--can", spec)
     assert (found["uuid"], found["can_address"]) == (UUIDS[1], address)
-    assert "nodes" not in found
+    assert [node["uuid"] for node in found["nodes"]] == [UUIDS[1]], "all that answered, as without node="
 
 
 def test_two_runs_of_one_station_at_once_end_well_one_after_the_other(station: Station, bus: list[Node]) -> None:
