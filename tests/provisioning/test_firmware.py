@@ -354,7 +354,7 @@ def test_it_costs_identify_one_more_round_trip(
         board = FirmwareBoard(report=report)
         link = on_bus(board)
         with met(board, link) as node:
-            identify_step._identified(station, node, False)
+            identify_step._identified(station, node, add=False, dry_run=False)
         return link.count
 
     with_it = exchanges()
