@@ -167,6 +167,20 @@ def test_a_node_without_a_link_is_told_what_to_name(home: Path, monkeypatch: pyt
         assert all(word in error["hint"] for word in ("--can", "--ble", "--nfc", "config.toml", "CAN bus", "0x21"))
 
 
+def test_auto_chooses_from_usb_readers_and_from_those_of_pc_sc_only_without_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """PC/SC names a USB reader once more: both would be two readers, of which auto takes none."""
+    monkeypatch.setattr(reader, "paths", lambda: ["pcsc:ACS ACR122U 00 00"])
+    for usb, found in (
+        ([(0x072F, 0x2200, 1, 5)], ["usb:001:005"]),
+        ([(0x072F, 0x2200, 1, 5), (0x04E6, 0x5591, 2, 17)], ["usb:001:005", "usb:002:017"]),
+        ([], ["pcsc:ACS ACR122U 00 00"]),
+    ):
+        monkeypatch.setattr(reader, "_usb_readers", lambda _path, usb=usb: usb)
+        assert reader.plugged_in() == found
+
+
 def test_a_link_that_is_named_means_a_node_and_not_a_folder_of_its_name(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,7 +80,10 @@ def test_a_value_is_abandoned_at_the_end_of_the_dead_man(clock: Clock) -> None:
     actuator, node = held()
     with actuator:
         assert actuator.apply(0.05).value == pytest.approx(0.05, abs=1e-4)
-    assert node.allowed == [DEAD_MAN / 1000]
+        applied = actuator.apply(0.05)
+        assert applied.value == pytest.approx(0.11 * 1861 / 4095, abs=1e-7), "what a sample of 12 bits can hold"
+        assert (applied.channel, applied.unit, applied.raw) == (1, "m", 1861)
+    assert node.allowed == [DEAD_MAN / 1000] * 2
     assert actuator.require_confirmation() is True
 
 

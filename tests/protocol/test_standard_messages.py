@@ -5,7 +5,10 @@ Nothing here is computed from the tables that it holds; a peer reads these numbe
 
 from __future__ import annotations
 
+import pytest
+
 from teds_provision.protocol.messages import tables
+from teds_provision.protocol.messages.frames import decode_reply
 
 STATUS = "attributes:u8 status:u8 size:u32 checksum:u16 max_size:u32"
 SEGMENT = "offset:u32 octets:octets"
@@ -157,3 +160,9 @@ def test_modes_of_the_commands_are_not_the_capabilities_of_the_teds() -> None:
         "halt_mode": {0: "not applicable", 1: "halt at once", 2: "halt at end of data set", 3: "ramp"},
         "address_type": {1: "IPv4", 2: "IPv6"},
     }
+
+
+@pytest.mark.parametrize(("flag", "ok"), [(0, False), (1, True), (2, True), (0x80, True), (0xFF, True)])
+def test_a_reply_has_failed_if_its_flag_is_0_alone(flag: int, ok: bool) -> None:
+    reply = decode_reply(bytes([flag, 0, 2, 7, 8]))
+    assert (reply.ok, reply.payload) == (ok, b"\7\10")

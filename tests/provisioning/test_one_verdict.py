@@ -37,7 +37,7 @@ from teds_provision.station.store.records import NodeReading, RevocationRecord, 
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.image import SECURITY
-from tests.bench import Board, MemoryLink, talk
+from tests.bench import Board, MemoryLink, make_station, talk
 from tests.handover.desk import Pair, provisioned
 
 NAME = (0, AccessCode.NAME)
@@ -263,6 +263,22 @@ def test_what_is_received_outside_a_session_changes_no_row(station: Station, boa
     assert plain.origin == "plain"
     assert station.datasheets.reading(board.uuid) == before
     assert shown(station, board) == ("authentic", "session")
+
+
+def test_only_a_datasheet_that_was_read_in_a_session_is_kept(station: Station, board: Board, tmp_path: Path) -> None:
+    """Whatever its checks gave: what anybody on the bus may have sent is shown beside, as its row."""
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    row, judged = readings.judge_reading(station, image, bytes(8), by="verify", floor=None)
+    assert judged.verified.verdict != "not authentic"
+    other = make_station(tmp_path / "other", "other")
+    with other.durable("test"):
+        readings.keep_judged(other, replace(row, c=None), judged, image)
+    assert other.datasheets.datasheet(board.uuid) is None
+    with other.durable("test"):
+        readings.keep_judged(other, row, judged, image)
+    assert other.datasheets.datasheet(board.uuid) == image
+    other.close()
 
 
 def test_a_reading_in_no_session_is_replaced_by_any(station: Station) -> None:

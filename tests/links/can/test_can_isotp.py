@@ -325,6 +325,19 @@ def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, 
     assert gathering.conflicts == {NODE}
 
 
+def test_a_second_first_frame_of_one_address_is_a_conflict_and_certain_if_it_differs() -> None:
+    """Two nodes may have the same answer: an equal one counts as well, although the answer is whole after it."""
+    frames = frames_of(NODE, b"\x07" + bytes(10))
+    assert len(frames) == 2
+    other = frames_of(NODE, b"\x07" + bytes([1]) * 10)[0]
+    for first, clashes in ((frames[0], set()), (other, {NODE})):
+        gathering = BroadcastReplies(STATION, 7)
+        for frame in (first, *frames):
+            gathering.add_frame(frame)
+        assert gathering.answers == {NODE: bytes(10)}
+        assert (gathering.conflicts, gathering.repeated, gathering.clashes) == ({NODE}, {NODE}, clashes)
+
+
 @given(st.lists(st.tuples(st.integers(0x18DAF101, 0x18DAF104), st.binary(max_size=64)), max_size=40))
 def test_no_frames_break_a_gathering(frames: list[tuple[int, bytes]]) -> None:
     gathering = BroadcastReplies(STATION, 7)

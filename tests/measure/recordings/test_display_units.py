@@ -84,6 +84,18 @@ def test_a_file_holds_what_people_read_and_its_readers_have_si_again(tmp_path: P
     assert (facts[WARM.key].low, facts[WARM.key].uncertainty) == pytest.approx((233.15, 0.5))
 
 
+def test_an_uncertainty_is_a_difference_and_has_no_offset(tmp_path: Path) -> None:
+    """0.5 K is 0.5 degrees Celsius, not -272.65."""
+    facts = replace(WARM, deviation=0.25)
+    shown = in_display_units(facts)
+    assert (shown.unit, shown.low, shown.high) == ("°C", pytest.approx(-40.0), pytest.approx(125.0))
+    assert (shown.uncertainty, shown.deviation) == (pytest.approx(0.5), pytest.approx(0.25))
+    back = in_si_units(shown)
+    assert (back.low, back.uncertainty, back.deviation) == pytest.approx((233.15, 0.5, 0.25))
+    turned = in_display_units(TURNED)
+    assert turned.uncertainty == pytest.approx(math.degrees(0.01))
+
+
 def test_the_default_is_si_and_says_so_and_mcap_is_always_si(tmp_path: Path) -> None:
     plain = recorded(tmp_path / "run.csv", "si")
     assert "# units: SI\n" in plain.read_text()

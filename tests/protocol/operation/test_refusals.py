@@ -264,6 +264,7 @@ def test_subscribe_in_the_order_of_section_4() -> None:
             ("period 0, too long as well", subscribe(period=0, n=200), U.OUT_OF_RANGE),
             ("period above 10^12", subscribe(period=10**12 + 1), U.OUT_OF_RANGE),
             ("shorter than SPeriod", subscribe(channels=(3,), period=19 * MS), U.OUT_OF_RANGE),
+            ("shorter than a later channel's", subscribe(channels=(1, 3), period=19 * MS), U.OUT_OF_RANGE),
             ("a period that the clock does not keep", subscribe(period=7), U.OUT_OF_RANGE),
             ("too long, budget broken too", subscribe(n=114, gap=65535), U.TOO_LARGE),
             ("the budget", subscribe(n=1, gap=5001), U.DOES_NOT_FIT),
