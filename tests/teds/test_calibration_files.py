@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
@@ -363,3 +364,41 @@ def test_the_uncertainty_is_the_stated_one_or_the_largest_residual_if_that_is_gr
     text = f"# method: linear\n{stated}0,0\n1,1.75\n2,1.25\n3,3\n"
     found = fit_points(text, "c.csv")[1]
     assert found.uncertainty == pytest.approx(uncertainty)
+
+
+def test_an_uncertainty_in_another_unit_is_converted_as_a_difference() -> None:
+    """500 mK are 0.5 degC of uncertainty; as a value they are -272.65 degC."""
+    celsius = load_profile("temperature-sensor")
+    points = "raw,value [degC]\n0,-40\n21120,125\n"
+    assert read_calibrations(f"# uncertainty: 500 mK\n{points}", "c.csv", celsius)[1].uncertainty == pytest.approx(0.5)
+
+
+POINTS = "0,0\n1,1\n2,3\n3,8\n4,5\n"
+
+
+@pytest.mark.parametrize(
+    ("asked", "text", "method", "degree", "interval"),
+    [
+        ({"method": "polynomial", "degree": 2, "interval": 7.0}, POINTS, "polynomial", 2, 7.0),
+        (
+            {"method": "polynomial", "degree": 2, "interval": 7.0},
+            f"# degree: 1\n# interval: 9 s\n{POINTS}",
+            "polynomial",
+            1,
+            9.0,
+        ),
+        ({"method": "polynomial", "degree": None, "interval": None}, POINTS, "polynomial", 3, None),
+        ({"method": "polynomial", "degree": None}, "0,0\n1,1\n2,3\n", "polynomial", 2, 31556952.0),
+        ({"method": "linear", "degree": None}, POINTS, "linear", 1, 31556952.0),
+        ({"method": "linear", "degree": None}, f"# method: steps\n{POINTS}", "steps", 0, 31556952.0),
+        ({"method": "", "degree": None}, POINTS, "table", 1, 31556952.0),
+        ({"method": "", "degree": None}, "0,0\n1,1\n", "linear", 1, 31556952.0),
+    ],
+)
+def test_what_a_file_leaves_out_is_the_profiles_or_the_usual(
+    asked: dict[str, object], text: str, method: str, degree: int, interval: float | None, angle: Profile
+) -> None:
+    channel = angle.channels[0]
+    profile = replace(angle, channels=(replace(channel, calibration=replace(channel.calibration, **asked)),))  # type: ignore[arg-type]
+    found = read_calibrations(text, "c.csv", profile)[1]
+    assert (found.method, found.inputs[0].degree, found.interval) == (method, degree, interval)

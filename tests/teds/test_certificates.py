@@ -215,6 +215,40 @@ def test_slope_and_intercept_or_coefficients_are_taken_as_they_are(angle: Profil
     assert read_certified(many, "c", angle)[1].coefficients == pytest.approx((1, 0.005, 1e-9))
 
 
+@pytest.mark.parametrize(
+    ("raw", "reference", "uncertainty"),
+    [
+        ("200", "0.4", 100 * 90.3 / 16420),  # the steepest part is the second one
+        ("20 400 20 20", "0.4", 200 * 90.3 / 16420),
+        ("2", "0.4", 0.2),
+        ("2", "0.1 0.8 0.1 0.1", 0.4),
+    ],
+)
+def test_the_largest_uncertainty_counts_that_of_raw_values_by_the_steepest_part(
+    raw: str, reference: str, uncertainty: float, angle: Profile
+) -> None:
+    """Of expanded ones with k = 2."""
+    inside = (
+        f"<si:expandedUncXMLList><si:uncertaintyXMLList>{raw}</si:uncertaintyXMLList>"
+        "<si:coverageFactorXMLList>2</si:coverageFactorXMLList>"
+        "<si:coverageProbabilityXMLList>0.95</si:coverageProbabilityXMLList></si:expandedUncXMLList>"
+    )
+    text = ANGLE.decode()
+    end = text.index("</si:realListXMLList>", text.index("400 16700"))
+    octets = (text[:end] + inside + text[end:]).replace(">0.4<", f">{reference}<").encode()
+    assert read_certified(octets, "c", angle)[1].uncertainty == pytest.approx(uncertainty, rel=1e-6)
+
+
+def test_a_channel_of_floats_takes_indications_in_its_unit_as_values_in_si_units(temperature: Profile) -> None:
+    plain = _without_indication(temperature)
+    floats = replace(plain, fields={**plain.fields, "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 32}})
+    made = read_certified(TEMPERATURE, "c.xml", replace(temperature, channels=(floats,)), LEFT)[1]
+    assert [raw for raw, _ in made.points] == [273.19, 313.21, 353.24]
+    found = CertificateChoice(item="as-found")
+    made = read_certified(TEMPERATURE, "c.xml", replace(temperature, channels=(floats,)), found)[1]
+    assert [raw for raw, _ in made.points] == pytest.approx([273.79, 313.86, 353.98])
+
+
 # -- units -------------------------------------------------------------------------------------------------------------
 
 

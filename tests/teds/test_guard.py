@@ -112,9 +112,21 @@ def test_all_zero_coefficients_are_refused(tactile: Profile) -> None:
     assert "erased" in codes(findings)
 
 
-def test_an_erased_limit_or_offset_is_refused(tactile: Profile) -> None:
-    line = replace(force_line(), zero_offset=float("nan"))
-    assert codes(check_calibration(built(tactile, line), None, tactile)) == {"erased"}
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"zero_offset": math.nan}, "zero offset 1 of 1"),
+        ({"inputs": (CalibrationInput(1, 1, (0, math.inf), (0,)),)}, "boundary 2 of 2"),
+        ({"inputs": (CalibrationInput(1, 1, (0, 65535), (math.nan,)),)}, "offset 1 of 1"),
+        ({"low_limit": -math.inf}, "limit 1 of 1"),
+        ({"low_limit": 0.0, "high_limit": math.inf}, "limit 2 of 2"),
+        ({"uncertainty": math.inf}, "limit 1 of 1"),
+    ],
+)
+def test_an_erased_limit_or_offset_is_refused(changes: dict[str, Any], word: str, tactile: Profile) -> None:
+    findings = check_calibration(built(tactile, replace(force_line(), **changes)), None, tactile)
+    assert codes(findings) == {"erased"}
+    assert text(findings, "erased").startswith(word)
 
 
 def test_a_damaged_teds_is_refused(magnetic: Profile) -> None:
@@ -136,6 +148,12 @@ def test_boundaries_that_do_not_ascend_are_refused(tactile: Profile) -> None:
     part = CalibrationInput(1, 1, (0, 40000, 30000), (0, 40000))
     line = Calibration(1, "table", (part,), (0.0, 1e-4, 4.0, 1e-4), unit=parse_unit("N"))
     assert codes(check_calibration(built(tactile, line), None, tactile)) == {"inconsistent"}
+    second = CalibrationInput(2, 1, (40000, 30000), (0,))
+    both = Calibration(
+        1, "polynomial", (CalibrationInput(1, 1, (0, 65535), (0,)), second), (0.0, 0.0, 1e-4, 0.0), unit=parse_unit("N")
+    )
+    findings = check_calibration(built(tactile, both), None, tactile)
+    assert [finding.message for finding in findings] == ["the segment boundaries of input 2 do not ascend"]
 
 
 def test_a_calibration_of_another_kind_is_not_judged_but_reported(tactile: Profile) -> None:
@@ -315,6 +333,27 @@ def test_a_fit_whose_residual_exceeds_the_uncertainty_is_refused(tactile: Profil
     assert codes(with_points) == {"residual"}
     assert "misses its point at raw 32768" in text(with_points, "residual")
     assert codes(check_calibration(blocks)) == {"residual"}
+
+
+def test_the_uncertainty_of_a_calibration_in_degrees_celsius_is_a_difference() -> None:
+    profile = load_profile("temperature-sensor", [shipped_profiles()])
+    for stated, found in ((0.4, set()), (0.6, {"residual"})):
+        text_ = f"# uncertainty: {stated}\nraw,value [degC]\n0,-40\n21120,125\n"
+        calibrations = read_calibrations(text_, "x.csv", profile)
+        blocks = profile.build(UUID, calibration=calibrations).blocks
+        assert codes(check_calibration(blocks, None, profile)) == found
+
+
+def test_every_channel_is_judged_and_every_lost_calibration_is_reported(tactile: Profile) -> None:
+    lines = {1: force_line(), 2: replace(force_line(), channel=2), 3: replace(force_line(), channel=3)}
+    lines = {number: replace(line, inputs=(replace(line.inputs[0], channel=number),)) for number, line in lines.items()}
+    full = tactile.build(UUID, calibration=lines).blocks
+    bare = tactile.build(UUID, calibration={1: lines[1]}).blocks
+    assert [(f.channel, f.code) for f in check_calibration(bare, full, tactile)] == [(2, "removed"), (3, "removed")]
+    flat = {number: replace(line, coefficients=(5.0, 0.0)) for number, line in lines.items()}
+    bad = tactile.build(UUID, calibration=flat).blocks
+    found = check_calibration(bad, None, tactile)
+    assert [(f.channel, f.code) for f in found] == [(1, "flat"), (2, "flat"), (3, "flat")]
 
 
 def test_a_jump_in_a_table_is_refused(magnetic: Profile) -> None:

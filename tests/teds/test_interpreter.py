@@ -223,6 +223,19 @@ def test_limits_and_uncertainty_are_stated_in_the_unit_of_the_values() -> None:
     assert interpreter.inputs == (1,)
 
 
+def test_an_uncertainty_in_degrees_celsius_is_a_difference_and_widens_the_limits_by_itself() -> None:
+    part = CalibrationInput(1, 1, (0.0, 21120.0), (0.0,))
+    line = Calibration(1, "linear", (part,), (-41.0, 1 / 128), unit=parse_unit("degC"), uncertainty=0.75)
+    for calibration, uncertainty, valid in (
+        (line, 0.75, [False, True]),
+        (replace(line, uncertainty=None), 0.5, [False, False]),
+    ):
+        interpreter = ChannelInterpreter(sheet_of("temperature-sensor", {1: calibration}), 1)
+        assert interpreter.uncertainty == pytest.approx(uncertainty)
+        raws = np.array([0, 50], dtype=np.uint64)  # -41 and -40.61 degC
+        assert interpreter.values(raws).valid.tolist() == valid
+
+
 @pytest.mark.parametrize(
     ("own", "limits"),
     [
