@@ -89,6 +89,24 @@ def test_outside_the_outer_boundaries_the_end_segment_holds_and_is_flagged() -> 
     assert evaluate(SPLINE, 2000.0).outside == 1.0
 
 
+@pytest.mark.parametrize(
+    ("inputs", "outside"),
+    [
+        ((100, 20), 0.0),
+        ((0, 0), 0.0),
+        ((200, 40), 0.0),
+        ((201, 20), 1.0),
+        ((-1, 20), 1.0),
+        ((100, 41), 1.0),
+        ((100, -1), 1.0),
+        ((math.nan, 20), 1.0),
+        ((100, math.nan), 1.0),
+    ],
+)
+def test_each_input_is_held_to_its_own_outer_boundaries(inputs: tuple[float, float], outside: float) -> None:
+    assert evaluate(TWO_INPUTS, *inputs).outside == outside
+
+
 def test_arrays_and_scalars_give_the_same() -> None:
     x = np.random.default_rng(7).uniform(-50, 250, 50)
     grid = evaluate(TWO_INPUTS, x[:, None], np.linspace(-10, 50, 7)[None, :])
@@ -137,6 +155,12 @@ def test_the_residuals_of_a_line_are_shown() -> None:
     assert residuals.maximum == pytest.approx(2 / 3)
     assert residuals.rms == pytest.approx(math.sqrt(2) / 3)
     assert residuals.worst[0] == 1
+
+
+def test_a_zero_that_was_set_since_is_no_residual() -> None:
+    line = replace(fit([(0, 0.0), (1, 1.0), (2, 0.0)], "linear", channel=1), zero_offset=5.0)
+    assert residuals_of(line).curve == pytest.approx((1 / 3, 1 / 3, 1 / 3))
+    assert residuals_of(line).differences == pytest.approx((-1 / 3, 2 / 3, -1 / 3))
 
 
 def test_a_polynomial_survives_rounding_to_float32_over_16_bit_raw() -> None:
@@ -275,6 +299,22 @@ def test_an_overdue_calibration_is_warned_about() -> None:
     assert "no date" in SPLINE.date_warnings(now)[0]
     assert "due again" in replace(old, interval=None).date_warnings(now, 30 * 86400.0)[0]
     assert "longer than" in replace(old, date=now).date_warnings(now, 30 * 86400.0)[0]
+
+
+def test_a_calibration_is_overdue_after_its_moment_and_from_the_future_beyond_a_day() -> None:
+    now = datetime(2026, 11, 21, tzinfo=UTC)
+    year = 365 * 86400.0
+    due_now = replace(SPLINE, date=now - timedelta(days=365), interval=year)
+    assert (due_now.overdue(now), due_now.date_warnings(now)) == (False, [])
+    later = now + timedelta(seconds=1)
+    assert due_now.overdue(later)
+    assert due_now.date_warnings(later) == ["the calibration of 2025-11-21 was due again on 2026-11-21, 0 days ago."]
+    assert replace(SPLINE, date=now + timedelta(days=1)).date_warnings(now) == []
+    assert replace(SPLINE, date=now, interval=year).date_warnings(now, year) == []
+    assert replace(SPLINE, date=now, interval=year).date_warnings(now, year - 86400) == [
+        "its interval of 365 days is longer than the 364 days that its type asks for."
+    ]
+    assert replace(SPLINE, date=now, interval=0.0).due is None
 
 
 def test_a_calibration_is_shown_in_one_line_and_as_data(tactile: Profile) -> None:

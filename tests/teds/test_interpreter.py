@@ -374,6 +374,33 @@ def test_a_compensated_channel_asks_for_its_other_input() -> None:
     assert "not described" in ChannelInterpreter(replace(sheet, channels=sheet.channels[:1]), 1).problem
 
 
+def test_a_compensated_channel_may_be_any_input_of_its_curve() -> None:
+    """In the order of the inputs, forwards and back; what compensates it may be impossible or beyond its range too."""
+    inputs = (CalibrationInput(2, 1, (0, 1000), (0,)), CalibrationInput(1, 1, (0, 65535), (0,)))
+    both = Calibration(1, "polynomial", inputs, (0.0, 0.001, 0.0002, 0.0), unit=parse_unit("N"))
+    sheet = changed(sheet_of("tactile-finger-sensor", {1: both}), 2, sample=SampleForm(DataModel.UNSIGNED, 2, 12))
+    interpreter = ChannelInterpreter(sheet, 1)
+    assert (interpreter.inputs, interpreter.others) == ((2, 1), (2,))
+    own = np.array([5000, 5000, 5000, 5000], dtype=np.uint64)
+    other = {2: np.array([10, 1000, 1001, 4096], dtype=np.uint64)}
+    values = interpreter.values(own, other)
+    assert values.value[:3] == pytest.approx([5.002, 5.2, 5.2002], abs=1e-6)
+    assert values.valid.tolist() == [True, True, True, False]
+    assert values.extrapolated.tolist() == [False, False, True, True]
+    back = interpreter.encode(values.value[:3], {2: other[2][:3]})
+    assert back == bytes.fromhex("1388" * 3)
+
+
+@pytest.mark.parametrize(("slope", "raws"), [(0.05, [0.0, 200.0, 2000.0, 4000.0, 4095.0]), (-0.05, [4095.0, 3.0])])
+def test_the_way_back_goes_on_beyond_the_outer_boundaries_as_the_curve_does(slope: float, raws: list[float]) -> None:
+    """The end segments hold there, up to the ends between which the input is searched."""
+    part = CalibrationInput(1, 1, (1000.0, 2000.0, 3000.0), (1000.0, 2000.0))
+    spline = Calibration(1, "table", (part,), (50.0, slope, 50 + 1000 * slope, 2 * slope), zero_offset=7.0)
+    curve = PreparedCurve(spline)
+    inverse = PreparedInverse(curve, 0.0, 4095.0, step=0.25)
+    assert inverse(curve(np.array(raws))).tolist() == pytest.approx(raws)
+
+
 def actuator(calibration: Calibration | None = None) -> Sheet:
     sheet = sheet_of("gripper")
     number = next(channel.number for channel in sheet.channels if channel.actuator)
