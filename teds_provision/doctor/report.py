@@ -45,7 +45,8 @@ class Mask:
             _user(): "USER",
         }
         for link in (system.nfc, system.can, system.ble):
-            private[(link or "").partition(":")[2]] = "ADDRESS"  # hosts and ports of this site
+            if link:
+                private[link[len(_kind(link)) + 1 :]] = "ADDRESS"  # hosts and ports of this site
         # The longest first, so that replacing a folder does not cut the paths below it.
         self._private = sorted(
             ((word, name) for word, name in private.items() if len(word) > 1), key=lambda pair: -len(pair[0])
@@ -61,6 +62,11 @@ class Mask:
 
     def _number(self, found: re.Match[str]) -> str:
         return self._uuids.setdefault(found[0].lower(), f"UUID-{len(self._uuids) + 1}")
+
+
+def _kind(link: str) -> str:
+    """Return what a link is, without the place: ``tty``, ``socketcan``, ``hci0``."""
+    return re.split(r"[:?]", link, maxsplit=1)[0]
 
 
 def _user() -> str:
@@ -82,7 +88,7 @@ def build_report(
         "python": sys.version.split()[0],
         "platform": mask(platform.platform()),
         "packages": _packages(),
-        "links": {name: path.split(":")[0] for name in ("nfc", "can", "ble") if (path := getattr(system, name))},
+        "links": {name: _kind(path) for name in ("nfc", "can", "ble") if (path := getattr(system, name))},
         "config": sorted(_names(config)),
         "checks": [
             {"name": check.name, "result": check.result, "why": mask(check.why), "fix": mask(check.fix)}

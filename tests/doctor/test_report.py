@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import getpass
 import json
+import shutil
 import socket
 from pathlib import Path
 
 import pytest
 
 from teds_provision.doctor.checks import System
-from teds_provision.doctor.report import Mask
+from teds_provision.doctor.report import Mask, build_report
+from teds_provision.station.station import Station
 from tests.cli.shell import call
 
 UUID = "8d4d9da65281f7000000"
@@ -60,6 +62,43 @@ def test_one_uuid_is_one_word_and_fingerprints_are_gone(tmp_path: Path) -> None:
     assert mask("key " + "ab" * 32) == "key HEX"
     assert mask("5fa9 1809 991e e906 7a8b 1a1c 6ad8 114b") == "HEX"
     assert mask(f"{tmp_path}/x of {getpass.getuser()}") == "HOME/x of USER"
+
+
+def test_addresses_of_every_link_and_the_folders_of_a_user_are_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "bench-7")
+    system = System(
+        tmp_path / "home" / "teds", "tty:USB0:pn532", "socketcand:can0?host=10.1.2.3", "tcp-client:10.9.8.7:46100",
+        workspace=tmp_path / "home" / "work", environment={"HOME": str(tmp_path / "home")},
+    )  # fmt: skip
+    mask = Mask(system, with_uuids=True)
+    assert mask("nfc tty:USB0:pn532, can socketcand:can0?host=10.1.2.3, ble tcp-client:10.9.8.7:46100") == (
+        "nfc tty:ADDRESS, can socketcand:ADDRESS, ble tcp-client:ADDRESS"
+    )
+    board = Mask(System(tmp_path, ble="hci0?address=C4:9A:02:11:22:33"), with_uuids=True)
+    assert board("hci0?address=C4:9A:02:11:22:33 opens.") == "hci0?ADDRESS opens."
+    assert mask(f"{tmp_path}/home/teds/x {tmp_path}/home/work/y {tmp_path}/home/z") == "HOME/x WORKSPACE/y ~/z"
+    assert mask("bench-7, bench-78") == "HOST, bench-78"
+    assert mask(f"{UUID} {'ab' * 8} {'ab' * 7}") == f"{UUID} HEX {'ab' * 7}", "from 16 digits on, but UUIDs"
+
+
+def test_a_report_has_names_of_settings_kinds_of_links_and_the_last_errors(home: Path, tmp_path: Path) -> None:
+    here = tmp_path / "copy"
+    shutil.copytree(home, here)
+    with Station.inspect(here) as station:
+        for number in range(21):
+            station.audit("write", bytes.fromhex(UUID), f"refused {number} {UUID}")
+            station.audit("verify", None, "authentic")
+    config = {"nfc": "usb", "provision": {"via": "can"}, "ncap": {"brokers": {"lab": "mqtt://h"}}}
+    report = build_report(
+        System(here, "usb:072f:2200", ble="hci0?address=C4:9A:02:11:22:33"), [], config, with_uuids=False
+    )
+    assert report["config"] == ["ncap.brokers.lab", "nfc", "provision.via"]
+    assert report["links"] == {"nfc": "usb", "ble": "hci0"}
+    assert [(entry["act"], entry["outcome"], entry["uuid"]) for entry in report["errors"]] == [
+        ("write", f"refused {number} UUID-1", "UUID-1") for number in range(1, 21)
+    ]
 
 
 def test_a_report_never_replaces_a_file(home: Path, tmp_path: Path) -> None:

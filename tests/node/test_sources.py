@@ -61,6 +61,27 @@ def test_generated_values_keep_to_the_range_and_the_period() -> None:
     assert all(0 <= value <= 1 for value in seen)
 
 
+def test_each_channel_of_a_sine_lags_the_one_before_by_a_twelfth_of_the_period() -> None:
+    sine = make_source("sine:12", PLACES, print)
+    assert [sine.at(2, seconds).value for seconds in (1.0, 4.0, 10.0)] == pytest.approx([2.5, 5.0, 0.0])
+    assert sine.at(3, 5.0).value == pytest.approx(1.0), "a channel without a range goes from 0 to 1"
+
+
+def test_a_period_has_a_unit_or_is_in_seconds_and_is_10_s_if_none_is_given() -> None:
+    for text, seconds in (("ramp", 5.0), ("ramp:10s", 5.0), ("ramp:1min", 30.0), ("ramp: 0.5 ms", 0.00025)):
+        assert make_source(text, PLACES, print).at(2, seconds).value == pytest.approx(2.5), text
+    assert make_source("sine", PLACES, print).at(1, 2.5).value == pytest.approx(180.0)
+
+
+def test_noise_fills_the_range_of_its_channel() -> None:
+    noise = make_source("noise", PLACES, print)
+    force = [noise.at(2, 0.0).value for _ in range(50)]
+    angle = [noise.at(1, 0.0).value for _ in range(50)]
+    assert all(0 <= value <= 5 for value in force)
+    assert max(force) > 1, "once in 10^35 runs none is"
+    assert min(angle) < 0 < max(angle)
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [

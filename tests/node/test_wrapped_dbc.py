@@ -26,7 +26,7 @@ from teds_provision.node.hardware.board import Board
 from teds_provision.node.sources.base import Reading
 from teds_provision.node.wrapped import dbc_message, latest_values
 from teds_provision.node.wrapped.can_reader import CanReader, MessageReader
-from teds_provision.node.wrapped.dbc_message import DbcMessage, pgn_of
+from teds_provision.node.wrapped.dbc_message import DbcMessage, j1939_state, pgn_of
 from teds_provision.node.wrapped.description import WrappedChannel, facts, written_unit
 from teds_provision.node.wrapped.latest_values import LatestValues
 from teds_provision.node.wrapped.reading import describe
@@ -184,6 +184,62 @@ def test_a_j1939_message_is_matched_by_its_group_from_one_address() -> None:
     assert speed.at(9.0)[0] is not None
 
 
+def test_the_first_j1939_address_is_read_for_as_long_as_it_sends_and_others_are_reported_once() -> None:
+    """It is silent after three periods of 20 ms, counted from its last frame."""
+    messages: list[str] = []
+    shaft = reader("Shaft", messages)
+    speed = shaft.values[0]
+    octets = bytes.fromhex("4038c8ffffffffff")
+    for at in (5.0, 5.05, 5.1):
+        shaft.handle(SensorFrame(0x18FEF121, True, octets, at))
+    for address, at in ((0x22, 5.12), (0x23, 5.158)):
+        shaft.handle(SensorFrame(0x18FEF100 | address, True, octets, at))
+    assert speed.last is not None
+    assert speed.last.at == 5.1
+    assert len(messages) == 1
+    shaft.handle(SensorFrame(0x18FEF122, True, octets, 5.162))
+    shaft.handle(SensorFrame(0x18FEF121, True, octets, 5.17))
+    assert speed.last.at == 5.162
+
+
+@pytest.mark.parametrize(
+    ("bits", "error", "absent", "highest"),
+    [
+        (8, 0xFE, 0xFF, 0xFD),
+        (16, 0xFE00, 0xFFFF, 0xFDFF),
+        (24, 0xFE1234, 0xFF0000, 0xFDFFFF),
+        (32, 0xFEFFFFFF, 0xFF000000, 0xFDFFFFFF),
+    ],
+)
+def test_the_highest_octet_of_a_j1939_parameter_tells_whether_it_has_a_value(
+    bits: int, error: int, absent: int, highest: int
+) -> None:
+    assert j1939_state(bits, error) == "the device reports an error"
+    assert j1939_state(bits, absent) == "the device reports it as not available"
+    assert j1939_state(bits, highest) == ""
+    assert j1939_state(bits - 1, (1 << bits - 1) - 1) == "", "other sizes have no such values"
+
+
+@pytest.mark.parametrize(("cycle", "noted"), [(0, True), (50, False)])
+def test_a_message_without_a_cycle_time_has_100_ms_and_a_note(tmp_path: Path, cycle: int, noted: bool) -> None:
+    stated = f'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_ "GenMsgCycleTime" BO_ 100 {cycle};'
+    found = [written(tmp_path, ' SG_ x : 0|8@1+ (1,0) [0|0] "V" A', stated).sensor]
+    if noted:
+        found.append(written(tmp_path, ' SG_ x : 0|8@1+ (1,0) [0|0] "V" A').sensor)
+    note = "x: the file states no cycle time of One, so 100 ms is assumed (GenMsgCycleTime)."
+    for sensor in found:
+        assert sensor.channels[0].period == (0.1 if noted else 0.05)
+        assert sensor.notes == ((note,) if noted else ())
+
+
+def test_a_file_of_windows_tools_has_its_units_too(tmp_path: Path) -> None:
+    path = tmp_path / "one.dbc"
+    text = f'{HEAD}BO_ 100 One: 8 A\n SG_ x : 0|8@1+ (1,0) [0|0] "°C" A\n'
+    for encoding in ("cp1252", "utf-8"):
+        path.write_bytes(text.encode(encoding))
+        assert dbc_message.read(path).sensor.channels[0].unit == "degC", encoding
+
+
 def test_reasons_and_their_order() -> None:
     torque = reader("Torque")
     values = torque.values[0]
@@ -219,6 +275,9 @@ def test_a_frame_that_cannot_be_decoded_is_counted_and_changes_nothing() -> None
     assert (supply.frames, supply.bad, len(messages)) == (0, 2, 1)
     assert "Supply cannot be decoded" in messages[0]
     assert all(part.last is None for part in supply.values)
+    for _ in range(1997):
+        supply.handle(SensorFrame(292, False, bytes.fromhex("05"), 1.0))
+    assert [message.partition(" (")[2] for message in messages[1:]] == ["1000 so far)"], "then each thousandth"
 
 
 def test_a_frame_with_a_multiplexer_value_that_the_file_does_not_name_has_the_other_signals() -> None:

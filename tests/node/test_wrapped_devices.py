@@ -221,6 +221,59 @@ def test_iio_channels_have_scale_offset_unit_and_frequency(sysfs: Callable[..., 
     assert not Sheet.from_image(Image(UUID, sensor.blocks(UUID))).errors
 
 
+def test_iio_facts_of_a_channel_go_before_those_of_its_type(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    sysfs(
+        label="desk",
+        in_accel_x_raw="0",
+        in_accel_y_raw="0",
+        in_accel_x_scale="0.5",
+        in_accel_scale="0.25",
+        in_voltage1_raw="0",
+        in_voltage1_scale="2",
+        in_voltage_scale="4",
+        in_voltage1_offset="-3",
+        in_voltage_offset="-7",
+        in_temp_raw="7",
+        in_temp_input="21500",
+        in_smell_raw="1",
+    )
+    sensor = describe(f"iio:desk?root={tmp_path}")
+    assert sensor.title == "desk", "a device is found by its label"
+    found = {channel.name: channel for channel in sensor.channels}
+    assert {name: (c.scale, c.offset) for name, c in found.items()} == {
+        "accel_x": (0.5, 0.0),
+        "accel_y": (0.25, 0.0),
+        "voltage1": (2.0, -6.0),
+        "temp": (0.001, 0.0),
+        "smell": (1.0, 0.0),
+    }
+    assert found["temp"].is_float, "of both files, the one that holds a value"
+    assert {c.period for c in sensor.channels} == {0.1}
+    why = "the device states no sampling frequency, so 100 ms is assumed"
+    assert found["temp"].note == why
+    assert found["smell"].note == f"the type smell has no unit here: values are plain numbers; {why}"
+    assert found["smell"].unit == "count"
+
+
+@pytest.mark.parametrize(
+    ("files", "period", "stated"),
+    [
+        ({"sampling_frequency": "0"}, 0.1, False),
+        ({"sampling_frequency": "10000"}, 1e-4, True),
+        ({"sampling_frequency": "10001"}, 0.1, False),
+        ({"in_voltage_sampling_frequency": "8"}, 0.125, True),
+        ({"in_voltage_sampling_frequency": "8", "sampling_frequency": "4"}, 0.25, True),
+    ],
+)
+def test_an_iio_device_is_sampled_at_the_frequency_that_it_states(
+    sysfs: Callable[..., Path], tmp_path: Path, files: dict[str, str], period: float, stated: bool
+) -> None:
+    sysfs(name="adc", in_voltage_raw="0", **files)
+    (channel,) = describe(f"iio:adc?root={tmp_path}").channels
+    assert channel.period == period
+    assert (channel.note == "") is stated
+
+
 def test_iio_files_are_read_one_by_one_and_one_that_fails_says_why(sysfs: Callable[..., Path], tmp_path: Path) -> None:
     folder = sysfs(**PRESSURE)
     run = WrappedRun(
