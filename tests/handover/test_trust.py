@@ -65,8 +65,10 @@ def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) 
     add(north, [candidate(north, "lab", path, "station")])
     for text in ("lab", digits, digits[:16].upper(), spoken(digits), str(path)):
         assert find_trusted(north, text, "station").name == "lab"
-    with pytest.raises(NotFoundError):
-        find_trusted(north, digits[:6])
+    assert find_trusted(north, digits[:8]).name == "lab"
+    for short in (digits[:6], digits[:7]):
+        with pytest.raises(NotFoundError):
+            find_trusted(north, short)
     with pytest.raises(NotFoundError):
         find_trusted(north, "lab", "ca")
 
@@ -103,6 +105,12 @@ def test_a_name_belongs_to_one_key(north: Station, keys: Path) -> None:
     add(north, [candidate(north, "lab", keys / "21.pem", "station")])
     with pytest.raises(PolicyError, match="is already taken by"):
         candidate(north, "lab", keys / "22.pem", "station")
+    with pytest.raises(PolicyError, match="is already taken by the station"):
+        candidate(north, "lab", keys / "21.pem", "ca")
+    for name in ("", " lab", "lab ", "a" * 101):
+        with pytest.raises(UsageError, match="is not a valid name"):
+            candidate(north, name, keys / "22.pem", "station")
+    assert candidate(north, "a" * 100, keys / "22.pem", "station").record.name == "a" * 100
     with pytest.raises(UsageError):
         candidate(north, "a\x1b[31m", keys / "22.pem", "station")
 
@@ -111,6 +119,7 @@ def test_a_folder_of_keys_with_roles_by_name(north: Station, keys: Path) -> None
     (keys / "lab.pem").write_text(to_pem(OTHER.point))
     (keys / "owner.ca.pem").write_text(to_pem(SoftwareKey(22).point))
     (keys / "own.pem").write_text(to_pem(north.point))
+    (keys / "own.ca.pem").write_text(to_pem(north.ca))
     (keys / "README.md").write_text("Public keys.")
     found = candidates_of(north, keys, "station")
     assert [(found_key.record.name, found_key.record.role) for found_key in found] == [
@@ -126,10 +135,11 @@ def bad_files() -> dict[str, bytes]:
     return {
         "key.pem": private(key),
         "nested/deep.txt": b"some text before\n" + private(key),
-        "old.key": private(key, Encoding.DER),
+        **{f"old{suffix}": private(key, Encoding.DER) for suffix in (".key", ".der", ".p8", ".pk8", ".p12", ".pfx")},
         "jwk.json": json.dumps({"kty": "EC", "crv": "P-256", "d": "AA"}).encode(),
         "link.json": json.dumps({"kty": "oct", "k": "AA"}).encode(),
         "vault.json": b'{"format": "teds-provision-vault/1"}',
+        "export.json": b'{"format": "teds-vault/1"}',
     }
 
 
@@ -141,6 +151,16 @@ def test_a_folder_that_holds_a_private_key_is_refused_whole(north: Station, keys
     with pytest.raises(PolicyError, match="is for public keys"):
         candidates_of(north, keys, "station")
     assert north.policy.trusted() == []
+
+
+def test_public_keys_in_der_and_what_git_keeps_are_no_private_keys(north: Station, keys: Path) -> None:
+    (keys / "lab.pem").write_text(to_pem(OTHER.point))
+    shared = ec.generate_private_key(ec.SECP256R1()).public_key()
+    (keys / "lab.der").write_bytes(shared.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo))
+    (keys / "lab.jwk").write_text(json.dumps({"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA"}))
+    (keys / ".git").mkdir()
+    (keys / ".git" / "object").write_bytes(bad_files()["key.pem"])
+    assert [found.record.name for found in candidates_of(north, keys, "station")] == ["lab"]
 
 
 def test_the_keys_folder_of_this_workspace_holds_no_private_key() -> None:

@@ -16,12 +16,13 @@ import pytest
 from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, RosterExpiredError
 from teds_provision.plant import jobs
 from teds_provision.plant.jobs import close_job, job_id, read_job, require_open, take_job
-from teds_provision.plant.line import LineRun, LineUnit, _firmware_in_session
+from teds_provision.plant.line import LineRun, LineUnit, Scans, _firmware_in_session
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.plant.evidence import EvidenceClaim
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import RemovedMember
+from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import PreparedOrder
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import IdentifiedNode
@@ -405,6 +406,39 @@ def test_a_calibration_may_be_so_many_days_old_and_a_day_ahead(
             continue
         with pytest.raises(PolicyError, match="the job allows at most 30 days"):
             run.order(board())
+
+
+@pytest.mark.parametrize("wrong", [{2: 31}, {1: 31}, {2: None}, {1: None, 2: 0}])
+def test_the_calibration_of_every_channel_must_be_recent_enough(
+    owner: Station, monkeypatch: pytest.MonkeyPatch, wrong: dict[int, int | None]
+) -> None:
+    run = LineRun(owner, job(owner, calibration=CalibrationRule("any", max_age_days=30)))
+    monkeypatch.setattr("teds_provision.plant.line.now_of", lambda roster: NOW)
+
+    def aged(days: dict[int, int | None]) -> PreparedOrder:
+        dates = {number: None if age is None else NOW - timedelta(days=age) for number, age in days.items()}
+        found = {number: SimpleNamespace(date=date) for number, date in dates.items()}
+        return cast("PreparedOrder", SimpleNamespace(calibrations=found))
+
+    run._require_fresh(Path("c.csv"), aged({1: 0, 2: 30}))
+    with pytest.raises(PolicyError, match=r"The calibration c\.csv of channel [12] .*at most 30 days"):
+        run._require_fresh(Path("c.csv"), aged({1: 0, 2: 0, **wrong}))
+
+
+def test_a_scan_is_of_the_last_label_with_its_key() -> None:
+    notices: list[str] = []
+    scans = Scans([f"{B.hex()}\n", f"TEDS1:{A.hex()}:{KEY}\n", "\n", "nonsense\n"], notices.append)
+    scans.listen()
+    assert notices == [
+        f"Waiting for board {B.hex()}.", f"Waiting for board {A.hex()}.", "This is not a board label: nonsense"
+    ]  # fmt: skip
+    scans.require(board(A))
+    for other in (board(B), board(A, "cd" * 32)):
+        with pytest.raises(WrongBoardError, match=f"belongs to board {A.hex()}, but this is board {other.uuid.hex()}"):
+            scans.require(other)
+    scans.require(board(A))
+    scans.add_label(B.hex().upper())
+    scans.require(board(B, "cd" * 32))
 
 
 def test_a_unit_belongs_to_its_job(owner: Station) -> None:

@@ -40,7 +40,7 @@ from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.station.store.records import NodeRecord, WhitelistEntry
 from tests.bench import Board, contact
 from tests.pace import PATIENCE
 
@@ -499,6 +499,10 @@ seconds of write,0.2500
 seconds of verify,0.5000
 """
     )
+    for sign in "=+-@":
+        progress.sheet = read(station, tmp_path, f"uuid,name\n8d4d9da65281f7000000,{sign}SUM(A1)\n,b\n,c\n")
+        write_report(tmp_path / "day.csv", progress, ReportHead("s", "f", "o", "w"))
+        assert f",'{sign}SUM(A1)," in (tmp_path / "day.csv").read_text()
     with pytest.raises(UsageError, match=r"day\.pdf is neither CSV nor HTML"):
         check_report(tmp_path / "day.pdf")
     with pytest.raises(NotFoundError, match=r"There is no folder .*none for the report"):
@@ -559,6 +563,62 @@ def test_options_that_exclude_each_other_are_refused_before_anything(
         BatchRun(station, links, request_, SilentReporter())
     assert refused.value.message.startswith(message)
     BatchRun(station, LinkSettings(nfc=("a", "b")), ProvisionRequest(watch=True), SilentReporter())
+
+
+@pytest.mark.parametrize(
+    ("rows", "good"),
+    [
+        (f"{{one}},,a\n,{LABEL_KEY},b\n", True),
+        (f"{{one}},,a\n,{LABEL_KEY},b\n,,c\n", False),
+        (",,c\n{one},,a\n", False),
+    ],
+)
+def test_on_a_bus_every_row_names_its_board(station: Station, tmp_path: Path, rows: str, good: bool) -> None:
+    file = tmp_path / "boards.csv"
+    file.write_text("uuid,fingerprint,name\n" + rows.format(one=board_of(1).hex()))
+    request = ProvisionRequest(order=BuildOrder(profile="load-cell"), whole_bus=True, sheet=file)
+    if good:
+        assert len(BatchRun(station, LinkSettings("can"), request, SilentReporter())) == 2
+        return
+    with pytest.raises(UsageError, match="rows cannot follow the order of taps"):
+        BatchRun(station, LinkSettings("can"), request, SilentReporter())
+
+
+def test_a_name_is_no_other_nodes_and_a_pattern_may_be_of_many_rows(station: Station, tmp_path: Path) -> None:
+    station.nodes.put(NodeRecord(board_of(9), name="taken"))
+    station.nodes.put(NodeRecord(board_of(1), name="own"))
+    patterns = "name\nb-{uuid}\nb-{uuid}\nc-{n}\nc-{n}\n"
+    assert len(read(station, tmp_path, patterns).rows) == 4
+    (row,) = read(station, tmp_path, f"uuid,name\n{board_of(1).hex()},own\n").rows
+    assert row.prepared.order.name == "own", "the board has it itself"
+    with pytest.raises(BadDataError) as caught:
+        read(station, tmp_path, f"uuid,name\n{board_of(1).hex()},taken\n")
+    assert caught.value.message == f"boards.csv:2: node {board_of(9).hex()} already has the name 'taken'."
+
+
+def test_a_calibration_lies_beside_the_sheet_and_may_be_of_one_channel_and_is_checked_before(
+    station: Station, tmp_path: Path
+) -> None:
+    (tmp_path / "force.csv").write_text("raw,value [N]\n0,0\n65535,10\n")
+    sheet = "name,profile,calibration\na,tactile-finger-sensor,2=force.csv\nb,tactile-finger-sensor,{second}\n"
+    first, second = read(station, tmp_path, sheet.format(second=f"3={tmp_path / 'force.csv'}")).rows
+    assert (first.prepared.order.calibration, first.prepared.order.channel) == (tmp_path / "force.csv", 2)
+    found = [list(row.prepared.calibrations or {}) for row in (first, second)]
+    assert found == [[2], [3]]
+    with pytest.raises(BadDataError, match=r"boards\.csv:3: .*channels 1 to 12, not 13"):
+        read(station, tmp_path, sheet.format(second="13=force.csv"))
+
+
+def test_the_report_gives_the_reason_for_a_row_that_is_done_again(station: Station, tmp_path: Path) -> None:
+    finished(station, tmp_path, "name\na\n")
+    again = Progress(station.home, read(station, tmp_path, "name\nb\n"))
+    (row,) = again.sheet.rows
+    for error, message in (
+        (None, "Provisioned again, because the sheet changed."),
+        (NodeSilentError("It was pulled."), "Provisioned again, because the sheet changed. It was pulled."),
+    ):
+        again.note(row, BoardResult(board_of(1), 1.0, error=error, row=1))
+        assert again.rows[1].message == message
 
 
 @pytest.mark.parametrize(
