@@ -33,7 +33,7 @@ from teds_provision.measure import presence, request
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.presence import MOST, TWIN, Presence
 from teds_provision.measure.request import Requirements
-from teds_provision.measure.running import retry_policy
+from teds_provision.measure.running import common_start, retry_policy
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.retry_policy import RetryPolicy
 from teds_provision.protocol.announce import Announce, uuid_crc
@@ -262,6 +262,35 @@ def test_a_stream_waits_for_the_trigger_until_it_has_gone_out() -> None:
 
 def sheet(uuid: bytes) -> Sheet:
     return Sheet.from_image(Image(uuid, load_profile(ANGLE, None).build(uuid).blocks))
+
+
+def test_a_trigger_waits_for_all_nodes_15_s_from_the_first_ready_one_and_is_noticed_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(common_start, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    common = CommonStart({ONE, TWO}, trigger=True)
+    assert (common.due(0, 2), common.notice_due()) == (False, False)
+    now[0] = 900.0
+    assert (common.due(0, 2), common.notice_due()) == (False, False), "nobody is ready yet"
+    assert (common.due(1, 2), common.notice_due()) == (False, False)
+    now[0] = 901.0
+    assert not common.notice_due()
+    now[0] = 901.5
+    assert [common.notice_due(), common.notice_due()] == [True, False]
+    now[0] = 915.0
+    assert not common.due(1, 2)
+    now[0] = 915.5
+    assert common.due(1, 2)
+    assert common.due(0, 2), "the first one counts, though it has gone since"
+    common.triggered()
+    assert (common.due(2, 2), common.seconds_left) == (False, 0.0)
+    at_once = CommonStart({ONE, TWO})
+    assert not at_once.due(2, 2), "a start time needs no trigger"
+    assert (at_once.seconds_left, at_once.spread) == (0.0, 0.0)
+    for uuid, tick in ((ONE, 10**9), (TWO, 10**9 + 4_000_000)):
+        at_once.record_start(uuid, clock(0), tick)
+    assert at_once.spread == pytest.approx(0.004, abs=1e-4)
 
 
 def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_waited_for() -> None:

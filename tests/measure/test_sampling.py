@@ -9,14 +9,17 @@ import pytest
 
 from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.measure import sample_series, sampling
+from teds_provision.measure.clock import ClockMap, Exchange, WallClock
 from teds_provision.measure.sample_series import require_still, take_samples_of
 from teds_provision.measure.sampling import Sample, shown_json
 from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.operation.commands import SampleReply
-from teds_provision.teds.calibration import fit
+from teds_provision.teds.calibration import Calibration, CalibrationInput, fit
+from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.calibration.zero import SampleStatistics
 from teds_provision.teds.units import parse_unit
-from tests.teds.test_interpreter import sheet_of
+from tests.teds.test_interpreter import changed, sheet_of
 
 SHEET = sheet_of("gripper", {2: fit([(0, 0.0), (4095, 0.11)], "linear", channel=2)})
 ACTUATOR, OPENING = 1, 2
@@ -146,3 +149,59 @@ def test_channels_are_sampled_together_as_far_as_a_reply_of_any_node_holds_them(
     """180 octets of data, and 64 channels (operation.md): a longer one is asked for alone."""
     interpreters = {number: cast(Any, SimpleNamespace(octets=size)) for number, size in enumerate(octets)}
     assert sampling._parts(interpreters) == parts
+
+
+class SampledNode:
+    """A node that answers Sample with these raw values and the flags of each channel; one channel a reply."""
+
+    def __init__(self, raws: dict[int, int], marked: set[int]) -> None:
+        self.raws, self.marked, self.course = raws, marked, list[str]()
+
+    def request(self, command: Command, doing: str) -> bytes:
+        self.course.append(f"{doing} {command.payload.hex()}".strip())
+        if doing != "to sample":
+            return b""
+        number = command.payload[0]
+        return SampleReply(number * 10**9, number in self.marked, self.raws[number].to_bytes(2, "big")).encode()
+
+
+@pytest.mark.parametrize(
+    ("raws", "marked", "lie", "why"),
+    [
+        ({1: 5000, 2: 10}, set(), "", ""),
+        ({1: 5000, 2: 10}, set(), "its clock was set", ""),
+        ({1: 5000, 2: 10}, {1}, "", "the node marks it as invalid"),
+        ({1: 5000, 2: 10}, {2}, "", "the node marks it as invalid"),
+        ({1: 5000, 2: 4096}, set(), "", "the raw value is none that the channel can give"),
+        ({1: 4096, 2: 4096}, {2}, "", "the node marks it as invalid"),
+    ],
+)
+def test_a_compensated_sample_is_valid_if_every_reading_that_it_takes_is(
+    raws: dict[int, int], marked: set[int], lie: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its time is that of its own reply by the node's clock, or of its arrival if that clock is dishonest."""
+    inputs = (CalibrationInput(1, 1, (0, 65535), (0,)), CalibrationInput(2, 1, (0, 65535), (0,)))
+    both = Calibration(1, "polynomial", inputs, (0.0, 0.0001, 0.0005, 0.0), unit=parse_unit("N"))
+    sheet = changed(sheet_of("tactile-finger-sensor", {1: both}), 2, sample=SampleForm(DataModel.UNSIGNED, 2, 12))
+    node = SampledNode(raws, marked)
+
+    def exchange(_node: object, clock: ClockMap) -> None:
+        node.course.append("clock")
+        assert clock.exchange(Exchange(50 * 10**9, 50 * 10**9, 0, 0, 1, 20)), clock.lie
+        clock.lie = lie
+
+    monkeypatch.setattr(sampling, "exchange_clock", exchange)
+    monkeypatch.setattr(
+        sampling, "claim", lambda _trusted, number, *, lease: node.course.append(f"claim {number} for {lease} s")
+    )
+    monkeypatch.setattr(WallClock, "now", lambda: WallClock(1000.0))
+    monkeypatch.setattr(sampling, "time", SimpleNamespace(time=lambda: 7000.0))
+    monkeypatch.setattr(sampling, "ROOM", 2)
+    trusted = VerifiedSession(cast(Any, node), sheet, "00" * 32, "finger")
+    [found] = sampling.take_samples(trusted, [1])
+    assert node.course == [
+        "clock", "clock", "clock", "claim 1 for 5 s", "claim 2 for 5 s", "to sample 01", "to sample 02", "to let go",
+    ]  # fmt: skip
+    assert (found.channel, found.raw, found.valid, found.why) == (1, raws[1], not why, why)
+    assert found.value == (None if why else pytest.approx(2.501, abs=1e-6))
+    assert found.time == pytest.approx(7000.0 if lie else 1051.0, abs=1e-3)

@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision.errors import NodeRefusedError, NotAuthenticError
 from teds_provision.measure.blocks import InvalidValues
-from teds_provision.measure.clock import HostClock
+from teds_provision.measure.clock import Exchange, HostClock
 from teds_provision.measure.running import streams as of_streams
 from teds_provision.measure.running.streams import SILENT, NodeStreams, StreamTotals
 from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
@@ -69,6 +69,15 @@ def test_events_and_what_waits_for_a_trigger_may_be_silent_and_other_streams_for
     assert streams.silent(now) == pytest.approx(SILENT + 0.7)
     assert streams.heard_since(now - SILENT - 0.8)
     assert not streams.heard_since(now - SILENT - 0.6)
+
+
+def test_the_last_of_its_streams_takes_its_first_sample_when_all_have_begun() -> None:
+    streams = NodeStreams(HostClock(), lambda _block: None)
+    assert streams.first_sample() == 0.0
+    streams.clock.exchange(Exchange(50 * 10**9, 50 * 10**9, 10**9, 10**9, 1, 20))
+    for number, start in ((0, 3 * 10**9), (1, 4 * 10**9), (2, None), (3, 2 * 10**9)):
+        streams.running[number] = cast(Any, SimpleNamespace(receiver=SimpleNamespace(start=start)))
+    assert streams.first_sample() == pytest.approx(53.0, abs=1e-3)
 
 
 def heard(messages: int, samples: int, bound: float | None, **counts: int) -> Any:

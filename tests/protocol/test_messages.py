@@ -207,6 +207,52 @@ def test_error_codes_of_replies_say_where_and_what():
     assert message.arguments[0].meaning == "time-out (remote .X)"
 
 
+@pytest.mark.parametrize(
+    ("message_type", "ok", "names"),
+    [
+        (1, None, ["octets"]),
+        (2, False, ["error", "octets"]),
+        (3, None, ["octets"]),
+        (4, None, ["octets"]),
+        (5, None, ["octets"]),
+    ],
+)
+def test_of_the_messages_of_a_service_a_reply_alone_begins_with_an_error_code(message_type, ok, names):
+    message = decode_message(bytes.fromhex(f"020e{message_type:02x}0003000101"))
+    assert (message.ok, [argument.name for argument in message.arguments]) == (ok, names)
+
+
+@pytest.mark.parametrize(
+    ("channel", "meaning"),
+    [(0, "the TIM itself"), (1, ""), (0x7FFF, ""), (0x8000, ""), (0xFFFE, ""), (0xFFFF, "every TransducerChannel")],
+)
+def test_channels_0_and_ffff_are_named(channel, meaning):
+    octets = bytearray(octets_of("m24_readteds_cmd_chan"))
+    octets[5 + 48 : 5 + 50] = channel.to_bytes(2, "big")
+    message = decode_message(bytes(octets))
+    [found] = [argument for argument in message.arguments if argument.name == "channel"]
+    assert (message.channel, found.value, found.meaning) == (channel, channel, meaning)
+    assert compose_command(channel, 4, 1).hex() == f"{channel:04x}" + "0401" + "0000"
+
+
+def test_a_failure_has_the_form_of_the_reply_or_octets_or_a_reason():
+    """EPOS answers a failed Read with offset 0; we answer with one octet, the reason."""
+    read, query = (
+        compose_command(1, 1, 2, {"access_code": 3, "offset": 0}),
+        compose_command(1, 1, 1, {"access_code": 3}),
+    )
+
+    def names(request, reply):
+        message = decode_message(bytes.fromhex(reply), request=decode_message(request))
+        assert message.ok is False
+        return message.name, [argument.name for argument in message.arguments]
+
+    assert names(read, "00" + "0004" + "00000000") == ("Failure of Read TEDS segment", ["offset", "octets"])
+    assert names(query, "00" + "000c" + "00" * 12)[1] == ["attributes", "status", "size", "checksum", "max_size"]
+    assert names(query, "00" + "0002" + "0101") == ("Failure of Query TEDS", ["octets"])
+    assert names(query, "00" + "0001" + "12") == ("Refusal", ["reason"])
+
+
 def test_composing_names_the_argument_at_fault():
     with pytest.raises(BadDataError, match="'offset'"):
         compose_command(1, 1, 2, {"access_code": 3})
