@@ -216,6 +216,68 @@ def test_no_octets_of_a_node_do_harm(octets: bytes) -> None:
             assert len(decode_data_set(octets, width)) == width
 
 
+@pytest.mark.parametrize(
+    ("decode", "octets"),
+    [
+        (SubscribeReply.decode, 12),
+        (DriveReply.decode, 4),
+        (ClockReply.decode, 34),
+        (PowerReply.decode, 7),
+        (decode_stopped, 4),
+        (lambda octets: SampleReply.decode(octets, 2), 11),
+        (lambda octets: decode_data_set(octets, 2), 6),
+    ],
+    ids=["subscribe", "drive", "clock", "power", "stop", "sample", "data set"],
+)
+def test_a_reply_of_an_octet_more_or_less_is_garbled(decode: Callable[[bytes], object], octets: int) -> None:
+    decode(bytes(octets))
+    for wrong in (octets - 1, octets + 1):
+        with pytest.raises(GarbledError):
+            decode(bytes(wrong))
+
+
+@pytest.mark.parametrize("offset", ["00000001", "01000000"])
+def test_a_data_set_begins_at_offset_0(offset: str) -> None:
+    assert decode_data_set(bytes.fromhex("00000000aabb"), 2) == b"\xaa\xbb"
+    with pytest.raises(GarbledError):
+        decode_data_set(bytes.fromhex(offset + "aabb"), 2)
+
+
+@pytest.mark.parametrize(
+    ("payload", "channels"),
+    [
+        ("00", {}),
+        ("01 01 02 f1 02 00 00 ff 80 00", {1: (2, 0xF1), 2: (0, 0), 255: (0x80, 0)}),
+        ("", None),
+        ("02", None),
+        ("01 01 02", None),
+        ("01 01 02 f1 02", None),
+        ("01 02 00 00 01 00 00", None),
+        ("01 02 00 00 02 00 00", None),
+        ("01 00 00 00 01 00 00", None),
+    ],
+)
+def test_operation_has_mode_0_or_1_and_each_channel_once_ascending(
+    payload: str, channels: dict[int, tuple[int, int]] | None
+) -> None:
+    octets = bytes.fromhex(payload)
+    if channels is None:
+        with pytest.raises(GarbledError):
+            OperationReply.decode(octets)
+        return
+    found = OperationReply.decode(octets)
+    assert (found.measuring, dict(found.channels)) == (octets[0] == 1, channels)
+
+
+def test_of_power_each_field_has_one_value_that_means_unknown() -> None:
+    unknown = PowerReply(0x10, None, None, None, None)
+    assert PowerReply.decode(bytes.fromhex("10 ff ffff 7fff 7f")) == unknown
+    assert unknown.encode().hex() == "10ffffff7fff7f"
+    assert PowerReply.decode(bytes.fromhex("00 00 0000 0000 00")) == PowerReply(0, 0, 0.0, 0.0, 0)
+    assert PowerReply.decode(bytes.fromhex("1f 64 fffe ff38 80")) == PowerReply(0x1F, 100, 65.534, -0.2, -128)
+    assert PowerReply.decode(bytes.fromhex("00 fe 0ce4 8000 ff")) == PowerReply(0, 254, 3.3, -32.768, -1)
+
+
 @given(st.binary(max_size=60))
 def test_no_octets_of_a_station_do_harm(octets: bytes) -> None:
     for decode in (SubscribeCommand.decode, ArmCommand.decode, lambda o: OperateCommand.decode(1, o, actuator=True)):
