@@ -1,16 +1,33 @@
-"""The numbers of docs/contract/cli.md and docs/contract/api.md, as literals."""
+"""The numbers of docs/contract/cli.md and docs/contract/api.md, and of the guides, as literals."""
 
 from __future__ import annotations
 
 from teds_provision import client, firmware_image
 from teds_provision.api import bodies, operations
 from teds_provision.cli.measure.record import SHOWN
+from teds_provision.limits import LIMITS
 from teds_provision.links import ports
+from teds_provision.links.ble import airtime
 from teds_provision.links.can import spec, transfer_pace
-from teds_provision.measure import background_reread, sample_series, standing, verified_session, zero
+from teds_provision.measure import (
+    background_reread,
+    clock,
+    grid,
+    planning,
+    sample_series,
+    standing,
+    stream_receiver,
+    topic_actuators,
+    verified_session,
+    zero,
+)
 from teds_provision.measure import sampling as one_sample
 from teds_provision.measure.held_actuator import LONGEST_PAUSE
-from teds_provision.measure.sinks import base, foxglove_server
+from teds_provision.measure.recordings import source
+from teds_provision.measure.running import common_start, measurement, streams
+from teds_provision.measure.sinks import base, files, foxglove_server, mqtt
+from teds_provision.measure.sinks.mcap import recording
+from teds_provision.measure.sinks.ros import child, rclpy_child, ros1_child, ros2
 from teds_provision.ncap import history, live, membership, waits
 from teds_provision.ncap.nodes import actuator_leases, simulation
 from teds_provision.ncap.web import app, guard, tokens
@@ -18,10 +35,13 @@ from teds_provision.node.wrapped import description
 from teds_provision.protocol import announce, fingerprints
 from teds_provision.protocol.messages import firmware
 from teds_provision.protocol.operation import budget
-from teds_provision.provisioning import batch_sheet, image_manager, update
+from teds_provision.provisioning import batch_sheet, image_manager, update, whitelist
 from teds_provision.station import groups, label
 from teds_provision.station import nodes as known_nodes
-from teds_provision.teds import channel
+from teds_provision.teds import channel, curve
+from teds_provision.teds.calibration import files as calibration_files
+from teds_provision.teds.calibration.model import MAXIMUM_INPUTS
+from teds_provision.teds.codec import decode
 from teds_provision.vault import agent
 
 
@@ -81,5 +101,62 @@ def test_the_numbers_of_the_contract() -> None:
         "the past": ((history.HOUR, history.MINUTE, history.FINE), (3600, 60, 0.01)),
         "a simulation feeds 1 MiB/s": (simulation.MOST_OCTETS, 1_048_576),
         "places of /live": ((app.MOST_LISTENERS, app.OF_ONE_TOKEN), (200, 100)),
+    }  # fmt: skip
+    assert {what: one for what, (one, _) in numbers.items()} == {what: due for what, (_, due) in numbers.items()}
+
+
+def test_the_numbers_of_the_guides() -> None:
+    numbers: dict[str, tuple[object, object]] = {
+        # docs/recording.md
+        "a part has 1 GiB": (files.LARGEST_PART, 1_073_741_824),
+        "values are in the file, then on the disk": ((files.FLUSH, files.SYNC), (0.1, 1.0)),
+        "a full disk needs 1 MiB": ((files.ROOM, files.AGAIN), (1_048_576, 1.0)),
+        "chunks of an MCAP": (recording.CHUNK_OCTETS, 65_536),
+        "a value of a row is no older than two periods": (grid.PERIODS_OF_A_VALUE, 2.0),
+        "what is read of a recording": (
+            (source.MOST.line, source.MOST.chunk, source.MOST.channels), (8_388_608, 67_108_864, 20_000)
+        ),
+        # docs/measuring.md
+        "readings of a clock at the start": (clock.AT_FIRST, 5),
+        "a node is silent": (streams.SILENT, 2.0),
+        "the last message is waited for": (stream_receiver.HEARD_OUT, 0.25),
+        "a message holds 20 ms; 10 Hz if nothing is stated": (
+            (planning.BLOCK, planning.UNSTATED), (20_000_000, 100_000_000)
+        ),
+        "messages of a Bluetooth adapter": (airtime.AIR_MESSAGES, 160.0),
+        "others start without a busy node": (common_start.WAITING, 2.0),
+        "values that wait for a recorder": (base.RECORDER_WAITING, 2_000_000),
+        "set points that go as Drive": (topic_actuators.DRIVE_ABOVE, 50),
+        # docs/ros.md
+        "rows leave, and a master is missed": ((measurement.BEAT, measurement.WAITING), (0.02, 3.0)),
+        "subscribers are waited for": (ros1_child.MEETING, 1.0),
+        "a child is started again": (child.BACK_OFF, (1.0, 30.0)),
+        "a reader of DDS may lag behind": ((ros2.HISTORY, rclpy_child.HISTORY), (100, 100)),
+        "a file of a broker's URL": (mqtt._MOST_OCTETS, 1_048_576),
+        # docs/formats.md
+        "a file of TEDS": (
+            (LIMITS.teds_file, LIMITS.teds_of_a_file, decode.MAX_OCTETS, decode.MAX_TUPLES),
+            (33_554_432, 2000, 16_777_216, 32_768),
+        ),
+        "JSON": ((LIMITS.json_values, LIMITS.json_depth, LIMITS.integer_digits), (2_000_000, 32, 1000)),
+        "XML": ((LIMITS.xml_elements, LIMITS.xml_attributes, LIMITS.xml_depth), (200_000, 400_000, 32)),
+        "a certificate": (
+            (LIMITS.certificate, LIMITS.certificate_tables, LIMITS.certificate_pairs, LIMITS.certificate_values),
+            (8_388_608, 200, 1000, 10_000),
+        ),
+        "Intel HEX": ((LIMITS.hex_records, LIMITS.hex_stretches), (2_500_000, 2000)),
+        "TOML": (
+            (LIMITS.text_file, LIMITS.toml_keys, LIMITS.toml_parts, LIMITS.toml_depth), (1_048_576, 20_000, 32, 16)
+        ),
+        "a calibration": (
+            (calibration_files.MAXIMUM_ROWS, calibration_files._LINE, MAXIMUM_INPUTS, curve.TERMS),
+            (200_000, 20_000, 8, 50_000_000),
+        ),
+        "a unit and an expression": ((LIMITS.unit, LIMITS.expression, LIMITS.terms), (64, 1000, 16)),
+        "a whitelist": (
+            (whitelist.MAX_FILE_OCTETS, whitelist.MAX_ENTRIES, whitelist._MAX_DEPTH, whitelist._MOST_TAGS,
+             whitelist._MOST_LINES, whitelist._MAX_TAG),
+            (67_108_864, 250_000, 16, 3_000_000, 1_000_000, 65_536),
+        ),
     }  # fmt: skip
     assert {what: one for what, (one, _) in numbers.items()} == {what: due for what, (_, due) in numbers.items()}

@@ -287,3 +287,44 @@ def test_a_value_in_between_goes_by_command_every_half_of_the_dead_man(monkeypat
     commands = [k for k in range(80) if "value within 1.0 s" in course.at(100 + k / 64)]
     assert commands == [*range(9), 40, 72], "64 a second; the rate is known with the tenth"
     assert len(sent) == 80 - len(commands)
+
+
+def test_set_points_go_as_drive_messages_only_while_one_actuator_of_the_node_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    course = Course(monkeypatch)
+    actuators = course.scene.actuators
+    driven: list[float] = []
+    monkeypatch.setattr(actuators, "_is_driven", lambda *_words: bool(driven.append(course.now)) or True)
+    other = actuators._actuators[2] = topic_actuators._Actuator(actuators._actuators[1].interpreter)
+    other.claimed_until = 100.5
+    for k in range(40):
+        course.at(100 + k / 64)
+    assert driven == [100 + k / 64 for k in range(32, 40)], "from the end of the other one's claim"
+
+
+def test_what_was_applied_is_published_as_a_sample_that_the_datasheet_can_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    course = Course(monkeypatch)
+    for k in range(3):
+        course.at(100 + k / 10)
+    found = course.scene.applied
+    assert [(block.uuid, block.stream, block.channels, block.index) for block in found] == [
+        (SHEET.uuid.hex(), 255, (1,), index) for index in range(3)
+    ]
+    assert found[0].raw.tolist() == [[1861]]
+    assert found[0].value.tolist() == [[pytest.approx(0.11 * 1861 / 4095, abs=1e-8)]], "not 0.05, which was asked"
+    assert found[0].valid.tolist() == [[True]]
+    assert not found[0].test_pattern
+
+
+def test_of_set_points_that_wait_the_newest_is_applied() -> None:
+    scene = Scene(lambda: reply(1))
+    with scene.turn:
+        for value in (0.01, 0.02, 0.03, 0.04):
+            scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, value, time.monotonic()))
+            until(lambda value=value: value > 0.01 or not scene.actuators._newest)
+    until(lambda: len(scene.applied) == 2)
+    scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 9, 0.05, time.monotonic()))
+    scene.actuators.close()
+    assert [round(float(block.value[0, 0]), 3) for block in scene.applied] == [0.01, 0.04]
+    assert scene.actuators.refused == 0, "another node's actuator is not refused here"

@@ -1,5 +1,6 @@
 """XML: valid by the shipped schema, hostile documents refused, schema and reader of one mind."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -109,6 +110,22 @@ def test_deep_nesting_is_refused():
     deep = '<field name="x">' * 5000 + "</field>" * 5000
     with pytest.raises(BadDataError):
         read_blocks(f'{OPEN}<teds access-code="1">{deep}</teds></teds-set>'.encode())
+
+
+@pytest.mark.parametrize("levels", [9, 10])
+def test_fields_nest_nine_levels(levels):
+    """A tree of nine is read, and refused for what is in it: no TEDS has fields so deep."""
+    value = '<field name="x"><integer>0</integer></field>'
+    for _ in range(levels - 1):
+        value = f'<field name="x">{value}</field>'
+    entry = {"name": "x", "kind": "integer", "value": 0}
+    for _ in range(levels - 1):
+        entry = {"name": "x", "fields": [entry]}
+    document = json.dumps({"format": "teds/1", "teds": [{"access_code": 1, "fields": [entry]}]})
+    for text in (f'{OPEN}<teds access-code="1">{value}</teds></teds-set>', document):
+        with pytest.raises(BadDataError) as refused:
+            read_blocks(text.encode())
+        assert ("nests too deep" in refused.value.message) is (levels == 10)
 
 
 def test_xml_in_another_encoding_is_read():

@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError, TedsProvisionError, UsageError
-from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks import files, open_sink
 from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
@@ -37,6 +38,7 @@ from teds_provision.measure.sinks.mcap.recover import recover
 from teds_provision.measure.sinks.mcap.writer import MAGIC, McapSummary, text
 from teds_provision.measure.sinks.mcap.writer import record as mcap_record
 from teds_provision.measure.sinks.mcap.zstandard_frames import compress_frame
+from teds_provision.measure.sinks.text import TextSink
 from tests.cli.shell import call, unmeasured_environment
 from tests.faults.disk import build_library, put_back
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks, fill
@@ -785,3 +787,66 @@ def test_a_recording_has_as_many_parts_as_its_error_says(tmp_path: Path, monkeyp
         assert [Path(file).name for file in sink.files] == [name]
     with pytest.raises(TedsProvisionError, match="There are 3 parts of"):
         open_sink(str(tmp_path / "run.csv")).open([ANGLE], STATION)
+
+
+def at_hand(path: Path) -> TextSink:
+    """Return a recorder that is open, without its thread."""
+    sink = TextSink(path)
+    sink._prepare((ANGLE,), STATION)
+    sink._begin()
+    return sink
+
+
+def test_a_part_that_is_larger_than_its_limit_is_the_last_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sink = at_hand(tmp_path / "run.csv")
+    sink._guarded_item(block())
+    sink.part.flush()
+    size = sink.part.size
+    for limit, parts in ((size, 1), (size - 1, 2)):
+        monkeypatch.setattr(files, "LARGEST_PART", limit)
+        sink._guarded_idle(time.monotonic())
+        assert len(sink.files) == parts
+    sink._finish()
+    assert [len(rows(Path(name).read_text())) for name in sink.files] == [3, 0]
+
+
+@pytest.mark.parametrize(
+    ("number", "what"),
+    [(errno.ENOSPC, "disk was full"), (errno.EDQUOT, "quota of the disk was used up"), (errno.EIO, "")],
+)
+def test_a_recording_pauses_on_a_full_disk_or_quota_until_a_mebibyte_is_free_and_on_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, what: str
+) -> None:
+    sink = at_hand(tmp_path / "run.csv")
+    sink.part.flush()
+
+    def fails(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Part, "flush", fails)
+        patched.setattr(files, "PIECE", 1)
+        if not what:
+            with pytest.raises(OSError, match="Input/output"):
+                sink._guarded_item(block())
+            return
+        sink._guarded_item(block())
+    sink._guarded_item((replace(ANGLE, name="elbow"),))
+    sink._guarded_item(block(index=3))
+    sink._guarded_item(ClockSet(1_795_000_100.0, 50.0))
+    assert (sink.stats.state, sink.stats.dropped) == ("waiting", 6)
+    began = sink._tried
+    for free, after, parts in ((1 << 20, 0.9, 1), ((1 << 20) - 1, 1.0, 1), (1 << 20, 1.9, 1), (1 << 20, 2.0, 2)):
+        monkeypatch.setattr(os, "statvfs", lambda _place, free=free: SimpleNamespace(f_bavail=free, f_frsize=1))
+        sink._guarded_idle(began + after)
+        assert len(sink.files) == parts, (free, after)
+    assert sink.stats.state == "running"
+    sink._guarded_item(block(index=6))
+    sink._close_part()
+    last = Path(sink.files[-1]).read_text()
+    assert re.search(rf"# \S+ The {what} from \S+ to \S+: 6 values are not recorded\.", last)
+    assert "The system clock was set forward by 50.000 s" in last
+    assert "# started: 2026-11-18T11:07:30" in last, "by the clock as it is now"
+    assert [row["arm/elbow raw"] for row in rows(last)] == ["1", "2", "3"], "what was learned meanwhile counts"

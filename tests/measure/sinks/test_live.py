@@ -163,8 +163,13 @@ def test_words_become_plain_letters() -> None:
         ("degC", "oil", "", "sensor_msgs/Temperature"),
         ("kPa", "supply", "", "sensor_msgs/FluidPressure"),
         ("MPa", "shear stress", "", "std_msgs/Float64"),
+        ("MPa", "tensile strength", "", "std_msgs/Float64"),
+        ("GPa", "Young's modulus", "", "std_msgs/Float64"),
+        ("kPa", "ch1", "wall_stress", "std_msgs/Float64"),
         ("lx", "light", "", "sensor_msgs/Illuminance"),
         ("%", "relative_humidity", "", "sensor_msgs/RelativeHumidity"),
+        ("%", "ch1", "relative-humidity", "sensor_msgs/RelativeHumidity"),
+        ("degC", "relative humidity, its sensor", "", "sensor_msgs/Temperature"),
         ("%", "throttle", "", "std_msgs/Float64"),
         ("m", "height", "", "std_msgs/Float64"),
         ("degree", "angle", "", "std_msgs/Float64"),
@@ -224,6 +229,8 @@ def test_a_range_finder_is_one_by_name_and_has_no_plain_number_beside() -> None:
     facts = ChannelFacts(ARM, "arm", 1, "range finder", units=parse_units("m"), low=0.5, high=8.0)
     assert is_range(facts)
     assert not is_range(replace(facts, name="height"))
+    assert is_range(replace(facts, name="height", quantity="range_finder")), "its profile calls it so"
+    assert not is_range(replace(facts, kind="actuator"))
     assert not is_range(replace(facts, units=parse_units("s")))
     sink = carried([block([[10]])], facts=[facts])
     assert sink.scalars == []
@@ -361,6 +368,22 @@ def test_a_gripper_is_a_joint_whose_state_goes_out_and_whose_set_points_come_in(
     assert sink.refused_commands == 3
 
 
+@pytest.mark.parametrize(
+    ("unit", "interface"),
+    [("rad", "position"), ("m", "position"), ("rad/s", "velocity"), ("m/s", "velocity"), ("N", "effort"),
+     ("N m", "effort"), ("K", None), ("m/s^2", None)],
+)  # fmt: skip
+def test_a_joint_is_commanded_by_what_its_unit_says_and_by_nothing_else(unit: str, interface: str | None) -> None:
+    came: list[SetPointCommand] = []
+    sink = carried([], facts=[replace(gripper()[0], units=parse_units(unit))], commands=came)
+    assert [joint.command for joint in sink._joints] == ([interface] if interface else [])
+    numbers = {"position": 0.01, "velocity": 0.02, "effort": 0.03}
+    sink._joint_command(["hand"], *([number] for number in numbers.values()))
+    assert [command.value for command in came] == ([numbers[interface]] if interface else [])
+    unsigned = [replace(facts, unsigned=True) for facts in gripper()]
+    assert joints_of(unsigned, Topics(STATION)) == []
+
+
 def test_sensors_alone_are_no_joint_and_their_owner_is_not_guessed() -> None:
     topics = Topics(STATION)
     assert joints_of([ANGLE, FORCE], topics) == []
@@ -423,6 +446,8 @@ def test_rows_faster_than_a_thousand_a_second_are_thinned_out() -> None:
 def test_the_array_is_there_before_its_first_row_but_none_for_a_test_pattern() -> None:
     assert carried([]).advertised == [("/bench/crane", JOINT_STATE), ("/bench/crane/age", JOINT_STATE)]
     assert carried([], station=replace(STATION, test_pattern=True)).advertised == []
+    joints = carried([], facts=gripper(), station=replace(STATION, test_pattern=True), commands=[])
+    assert (joints.advertised, joints.listens[1:]) == ([], []), "nor of joints"
 
 
 def test_a_test_pattern_reaches_no_topic() -> None:
@@ -443,6 +468,7 @@ def test_only_actuators_listen_and_only_if_commands_are_accepted() -> None:
     grip = replace(FORCE, kind="actuator")
     assert carried([], [ANGLE, grip], commands=[]).listens == [("/bench/hand/force/cmd", HAND, 2)]
     assert carried([], [ANGLE, grip]).listens == []
+    assert carried([], gripper()).listens == [], "a joint that may not be moved has a state alone"
 
 
 def test_a_command_that_is_no_number_moves_nothing() -> None:

@@ -356,10 +356,12 @@ class DeskClient:
 
     def __init__(self) -> None:
         self.published: list[tuple[str, bytes | str]] = []
+        self.retained: list[bool] = []
 
-    def publish(self, topic: str, payload: bytes | str, **_: object) -> SimpleNamespace:
+    def publish(self, topic: str, payload: bytes | str, *, retain: bool = False, **_: object) -> SimpleNamespace:
         """Take a message."""
         self.published.append((topic, payload))
+        self.retained.append(retain)
         return SimpleNamespace(rc=0)
 
 
@@ -432,3 +434,45 @@ def test_values_that_were_dropped_are_no_failure_of_a_broker_that_took_this_clie
     sink._finish()
     assert (sink.stats.error == "") is greeted
     assert greeted or "accepted nothing: nothing is listening at localhost:1883" in sink.stats.error
+
+
+def test_a_test_pattern_and_a_rate_of_nothing_reach_no_topic_and_an_invalid_value_is_null() -> None:
+    sink, client = desk_sink(replace(ANGLE, units=parse_units("rad")))
+    sink._process_item(block([[7]], [[1.5]], test_pattern=True))
+    sink._station = replace(STATION, scalar_rate=0.0)
+    sink._process_item(block([[7]], [[1.5]]))
+    assert (client.published, sink._newest) == ([], {})
+    sink._station = STATION
+    sink._process_item(block([[7], [8]], [[1.0], [0.5]], [[True], [False]]))
+    [(topic, octets)] = client.published
+    assert (topic, json.loads(octets)) == ("bench/arm", {"time": 1_795_000_000.01, "angle_1": None})
+    sink._process_item(block([[9]], [[1.5]]))
+    assert len(client.published) == 1, "ten times a second"
+    sink._due.clear()
+    sink._process_item(block([[9]], [[1.5]]))
+    assert json.loads(client.published[1][1])["angle_1"] == pytest.approx(85.9437), "degrees, as people read them"
+
+
+def test_what_is_announced_and_the_state_are_retained_and_values_are_not() -> None:
+    sink, client = desk_sink()
+    sink._process_item((replace(ANGLE, units=parse_units("rad"), unverified=True),))
+    sink._process_item(NodeReport(ARM, "running"))
+    sink._process_item(block())
+    assert [topic for topic, _ in client.published] == [
+        f"homeassistant/sensor/{ARM}/1/config", "bench/unverified/arm/state", "bench/unverified/arm",
+    ]  # fmt: skip
+    assert client.retained == [True, True, False]
+    config, _, values = (json.loads(octets) for _, octets in client.published)
+    assert (config["unit_of_measurement"], config["state_class"], "device_class" in config) == (
+        "°", "measurement", False
+    )  # fmt: skip
+    assert (config["name"], config["device"]["name"]) == ("angle (unverified)", "arm (unverified)")
+    assert config["unique_id"] == f"{ARM}_1"
+    assert config["availability"] == [
+        {"topic": "bench/status"},
+        {
+            "topic": "bench/unverified/arm/state",
+            "value_template": "{{ 'online' if value_json.state == 'running' else 'offline' }}",
+        },
+    ]
+    assert values["unverified"] is True
