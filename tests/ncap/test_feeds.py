@@ -10,8 +10,9 @@ import pytest
 
 from teds_provision.errors import NodeBusyError, NotFoundError, UsageError
 from teds_provision.ncap.nodes import simulation, virtual
-from teds_provision.ncap.nodes.simulation import MOST_OCTETS, SIMULATION, Feed, Pace
+from teds_provision.ncap.nodes.simulation import MOST_OCTETS, SIMULATION, CheckedLines, FedChannel, Feed, Pace
 from teds_provision.ncap.nodes.virtual import Virtual, Virtuals
+from teds_provision.node.sources.base import SourceChannel
 
 ONE, OTHER = "ab" * 10, "cd" * 10
 
@@ -86,3 +87,64 @@ def test_a_simulation_may_save_up_a_quarter_of_a_second_and_no_more(monkeypatch:
     now[0] += 3600.0
     assert pace.delay(MOST_OCTETS // 4) == 0.0
     assert pace.delay(MOST_OCTETS // 2) == pytest.approx(0.5)
+
+
+FED = [FedChannel(SourceChannel(2, "opening", 0.0, 110.0), "mm"), FedChannel(SourceChannel(3, "count"), "")]
+
+
+@pytest.mark.parametrize(
+    ("line", "skipped", "limited"),
+    [
+        ('{"value": {"opening": 0, "count": 1e9}}', "", ""),
+        ('{"value": {"opening": 110}}', "", ""),
+        ('{"value": {"opening": null}}', "", ""),
+        ('{"raw": {"opening": 9999}}', "", ""),
+        ('{"value": {"count": 5, "opening": -0.5}}', "", "opening: -0.5 mm is outside 0 to 110 mm"),
+        ('{"value": {"opening": 110.5}}', "", "opening: 110.5 mm is outside 0 to 110 mm"),
+        ('{"value": {"hand": 1}}', "the node has no sensor named 'hand'", ""),
+        ('{"t": -1}', '"t" is not a number of seconds of 0 or more', ""),
+    ],
+)
+def test_of_a_line_the_simulation_learns_why_it_is_skipped_or_which_value_is_limited(
+    line: str, skipped: str, limited: str
+) -> None:
+    checked = CheckedLines(FED)
+    assert checked.check(b'{"value": {"opening": 200}}')[1].startswith("opening: 200 mm")
+    limit = f"{limited}; the sensor gives the nearer limit" if limited else ""
+    assert checked.check(line.encode()) == (skipped, limit)
+    assert checked.limited == (2 if limited else 1)
+
+
+def test_a_simulation_is_sent_the_range_of_a_channel_that_has_one() -> None:
+    assert [channel.as_json() for channel in FED] == [
+        {"number": 2, "name": "opening", "unit": "mm", "low": 0.0, "high": 110.0},
+        {"number": 3, "name": "count", "unit": "", "low": None, "high": None},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "good"),
+    [
+        ("noise", True),
+        ("simulation", True),
+        ("sine:0.5", True),
+        ("sine:86400", True),
+        ("ramp:86400", True),
+        ("ramp:86401", False),
+        ("sine:86401", False),
+        ("sine:0", False),
+        ("sine", False),
+        ("noise:1", False),
+        ("simulation:/tmp/x", False),
+        ("exec:true", False),
+        ("-", False),
+        ("unix:x", False),
+        ("file:x.csv", False),
+    ],
+)
+def test_the_sources_of_a_virtual_transducer(source: str, good: bool) -> None:
+    if good:
+        virtual._check_source(source)
+        return
+    with pytest.raises(UsageError):
+        virtual._check_source(source)

@@ -25,6 +25,33 @@ def test_of_requests_that_wait_for_one_tap_the_first_is_served_first() -> None:
     assert done == ["first", "whichever comes next", "last"]
 
 
+def test_a_request_that_waits_for_a_tap_is_not_served_by_a_node_on_a_bus() -> None:
+    none: Any = None
+    node: Any = SimpleNamespace(tapped=False, uuid=bytes.fromhex(NODE))
+    jobs, done = NodeJobs(none, none, none), list[str]()
+    for uuid in (NODE, None):
+        jobs.wait_for(uuid, "provision", lambda _node: done.append("served"), 60.0)
+    assert (jobs.serve(node), done) == (False, [])
+    node.tapped = True
+    assert (jobs.serve(node), done) == (True, ["served"])
+
+
+@pytest.mark.parametrize(
+    ("present", "place", "many", "found"),
+    [(True, "can:x", True, True), (False, "can:x", True, False), (True, "nfc:x", False, False),
+     (True, "can:gone", True, False), (True, "", True, False)],
+)  # fmt: skip
+def test_a_node_is_on_a_bus_if_it_is_there_now_and_the_link_is_open_and_has_many(
+    present: bool, place: str, many: bool, found: bool
+) -> None:
+    none: Any = None
+    directory: Any = SimpleNamespace(seen=lambda _uuid: SimpleNamespace(present=present, place=place))
+    port: Any = SimpleNamespace(capabilities=SimpleNamespace(many=many))
+    ports = {"can:x": port, "nfc:x": port, "": port}
+    jobs = NodeJobs(directory, none, ports.get)
+    assert (jobs.bus_of(NODE), jobs.on_a_bus(NODE)) == ((port, True) if found else (None, False))
+
+
 def test_a_tap_after_the_time_of_a_request_is_not_for_it_and_who_waited_gives_it_up() -> None:
     """A tap between the two took the request away unserved: its waiter waited for ever, and no other could begin."""
     none: Any = None

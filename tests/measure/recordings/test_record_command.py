@@ -110,6 +110,63 @@ def test_show_speaks_peoples_units_and_json_speaks_si(tmp_path: Path) -> None:
     assert end["samples"] == 120, "the end counts the whole recording"
 
 
+def test_show_limits_what_is_shown_and_never_what_is_counted(tmp_path: Path) -> None:
+    """Twenty instants unless asked otherwise, of all channels or the chosen ones; with JSON all of them."""
+    path, home = recorded(tmp_path / "run.mcap"), tmp_path / "home"
+    plain = call(home, "record", "show", str(path))
+    assert len(plain.out.splitlines()) == 20
+    assert plain.err.strip() == "80 time stamps in all; use --limit to show more."
+    whole = call(home, "record", "show", str(path), "--limit", "80")
+    assert (len(whole.out.splitlines()), whole.err) == (80, "")
+    assert sum(line.endswith("arm/angle not valid") for line in whole.out.splitlines()) == 1
+    two = call(home, "record", "show", str(path), "--limit", "80", "--channel", "3", "--channel", "ANGLE").out
+    assert {cell.split()[0] for line in two.splitlines() for cell in line.split("  ")[1].split(", ")} == {
+        "arm/angle",
+        "hand/oil",
+    }
+    *events, end = map(json.loads, call(home, "--json", "record", "show", str(path), "--limit", "3").out.splitlines())
+    assert sum(len(event["time"]) for event in events if event["channel"] == 1) == 3
+    assert (end["messages"], end["samples"]) == (80, 120)
+    every = call(home, "--json", "record", "show", str(path)).out.splitlines()[:-1]
+    assert sum(len(json.loads(line)["time"]) for line in every) == 120
+    named, angle = tmp_path / "named.csv", replace(ANGLE, name="Shaft Angle")
+    fill_with(open_sink(str(named)), [angle], [block(), NodeReport(ARM, "ended", samples=3)])
+    assert len(call(home, "record", "show", str(named), "--channel", "shaft angle").out.splitlines()) == 3
+    assert "; lost: 0 messages, missing: 0 samples" in call(home, "record", "info", str(named)).out
+    for chosen in (("--channel", "3", "--channel", "palm"), ("--channel", "palm", "--channel", "3")):
+        unknown = call(home, "record", "show", str(path), *chosen)
+        assert unknown.code == 3
+        assert "has no channel 'palm'" in unknown.err
+
+
+def test_what_info_prints_of_a_recording(tmp_path: Path) -> None:
+    path, home = tmp_path / "run.csv", tmp_path / "home"
+    cut, pattern, empty = tmp_path / "cut.csv", tmp_path / "pattern.csv", tmp_path / "empty.csv"
+    sent = [block(valid=[[True], [False], [True]]), block(index=5)]
+    fill_with(open_sink(str(path)), [ANGLE], [*sent, NodeReport(ARM, "ended", samples=6, lost=1)])
+    head, dates, *lines = call(home, "record", "info", str(path)).out.splitlines()
+    assert head == f"{path}: CSV, station bench, group crane"
+    assert (dates[:5], " until " in dates) == ("From ", True)
+    assert lines[:2] == [
+        "6 time stamps, 6 values, 1 invalid; lost: 1 message, missing: 2 samples",
+        "  arm/angle: 6 values, 1 invalid, 5.72958 to 17.1887 °",
+    ]
+    cut.write_bytes(path.read_bytes().partition(b"\n1795000000.070")[0] + b"\n17950")
+    _, _, counts, end, *_ = call(home, "record", "info", str(cut)).out.splitlines()
+    assert counts == "5 time stamps, 5 values, 1 invalid; lost: not recorded, missing: 2 samples"
+    assert end == "It was cut off: no end was written, and the last 5 octets are incomplete."
+    cut.write_bytes(cut.read_bytes().removesuffix(b"17950"))
+    assert call(home, "record", "info", str(cut)).out.splitlines()[3] == "It was cut off: no end was written."
+    sink = open_sink(str(pattern))
+    sink.open([ANGLE], replace(STATION, test_pattern=True))
+    sink.write(block(test_pattern=True))
+    sink.close()
+    printed = call(home, "record", "info", str(pattern)).out.splitlines()
+    assert printed[1] == "TEST PATTERN: these are not measurements."
+    fill_with(open_sink(str(empty)), [ANGLE], [])
+    assert call(home, "record", "info", str(empty)).out.splitlines()[1] == "It contains no values."
+
+
 def test_a_file_that_may_not_grow_ends_a_conversion_with_words_and_leaves_nothing(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 15_000, 3)])
     program = f"{sys.executable} -m teds_provision record convert {source} {tmp_path / 'to.csv'}"
