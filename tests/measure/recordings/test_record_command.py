@@ -155,8 +155,6 @@ def test_what_info_prints_of_a_recording(tmp_path: Path) -> None:
     _, _, counts, end, *_ = call(home, "record", "info", str(cut)).out.splitlines()
     assert counts == "5 time stamps, 5 values, 1 invalid; lost: not recorded, missing: 2 samples"
     assert end == "It was cut off: no end was written, and the last 5 octets are incomplete."
-    cut.write_bytes(cut.read_bytes().removesuffix(b"17950"))
-    assert call(home, "record", "info", str(cut)).out.splitlines()[3] == "It was cut off: no end was written."
     sink = open_sink(str(pattern))
     sink.open([ANGLE], replace(STATION, test_pattern=True))
     sink.write(block(test_pattern=True))
