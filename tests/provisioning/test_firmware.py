@@ -168,6 +168,27 @@ def test_the_first_state_that_applies(report: FirmwareReport | None, state: str)
     assert state_of(None, report) == "unjudged"
 
 
+@pytest.mark.parametrize(
+    ("table", "report", "state"),
+    [
+        ('minimum = "1.2.0+45"', FirmwareReport("a", (1, 2, 0), 44), "outdated"),
+        ('minimum = "1.2.0+45"', FirmwareReport("a", (1, 2, 0), 45), "good"),
+        ('minimum = "1.2.0"', FirmwareReport("a", (1, 1, 9), 99), "outdated"),
+        (f'bad = ["1.0.0", "{"AB" * 32}"]', FirmwareReport("a", (1, 2, 0), 1, bytes([0xAB]) * 32), "bad"),
+        ('bad = ["1.2.0", "1.3.0+7"]', FirmwareReport("a", (1, 3, 0), 7), "bad"),
+        ('bad = ["1.2.0", "1.3.0+7"]', FirmwareReport("a", (1, 3, 0), 0), "good"),
+        ('bad = ["1.2.0", "1.3.0+7"]', FirmwareReport("a", (1, 2, 0), 8), "bad"),
+        ('text = "nrf[12]/a?"', FirmwareReport("nrf2/ab", (1, 0, 0)), "good"),
+        ('text = "nrf[12]/a?"', FirmwareReport("NRF2/ab", (1, 0, 0)), "other"),
+        ('text = "nrf[12]/a?"', FirmwareReport("nrf2/abc", (1, 0, 0)), "other"),
+        ("", FirmwareReport("a", (0, 0, 0)), "good"),
+    ],
+)
+def test_what_the_table_of_a_type_means(tmp_path: Path, table: str, report: FirmwareReport, state: str) -> None:
+    demand = teds.profile.load_profile(Path(profile(tmp_path, f"[firmware]\n{table}\n"))).firmware
+    assert state_of(demand, report) == state
+
+
 TABLE = '[firmware]\ntext = "*/angle"\nminimum = "1.2.0"\n'
 
 

@@ -251,6 +251,29 @@ def test_a_profile_says_only_what_differs_from_the_one_it_extends(tmp_path: Path
     assert profile.lineage == ("mine", "base")
 
 
+def test_tables_are_laid_over_each_other_key_by_key_and_lists_replaced_whole(tmp_path: Path) -> None:
+    more = 'links = ["nfc", "can"]\nabstract = true\n'
+    texts = '[[text]]\nkind = "title"\nxml = "a"\n[[text]]\nkind = "commands"\nxml = "b"\n'
+    write(tmp_path, "base", more + GOOD.replace('modes = ["trigger"]', 'modes = ["trigger", "immediate"]') + texts)
+    own = 'links = ["ble"]\n[channel.1]\nsample = { bits = 10 }\nsampling = { modes = ["continuous"] }\n'
+    own += '[[text]]\nkind = "title"\nxml = "c"\n'
+    profile = load_profile(write(tmp_path, "mine", f'extends = "base"\n{own}'), [tmp_path])
+    assert (profile.links, profile.abstract) == (("ble",), False)
+    fields = profile.channels[0].fields
+    assert fields["Sample"] == {"DatModel": 0, "ModLenth": 2, "SigBits": 10}
+    assert fields["Sampling"] == {"SampMode": 8, "SDefault": 8}
+    assert [(text.access_code, text.text) for text in profile.texts] == [(11, "c")]
+
+
+def test_a_name_has_120_octets_and_a_degree_is_from_1_to_12(tmp_path: Path) -> None:
+    long = "ä" * 60
+    for degree in (1, 12):
+        text = GOOD.replace('name = "force"', f'name = "{long}"').replace('"Force"', f'"Force"\nname = "{long}"')
+        profile = load_profile(write(tmp_path, "force", f"{text}[channel.1.calibration]\ndegree = {degree}\n"))
+        assert (profile.tim_name, profile.channels[0].name) == (long, long)
+        assert profile.channels[0].calibration.degree == degree
+
+
 def test_the_narrower_selection_of_channels_wins(tmp_path: Path) -> None:
     text = GOOD.replace("[channel.1]", "[channel.all]").replace('"force"', '"f {channel}"')
     text += "[channel.2]\nhigh-limit = 2\n[channel.1-3]\nhigh-limit = 3\n"
@@ -302,6 +325,12 @@ def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:
         ('"1 kHz"', '"1 kg"', 14, "channel.1.sampling-period", "time"),
         ("bits = 12", "bits = 17", 17, "channel.1.sample.bits", "16 bits"),
         ("octets = 2", "octets = 9", 17, "channel.1.sample.octets", "0 to 8"),
+        ('"unsigned", octets = 2', '"float32", octets = 8', 17, "channel.1.sample.octets", "has 4 octets"),
+        ('"unsigned", octets = 2', '"float64", octets = 4', 17, "channel.1.sample.octets", "has 8 octets"),
+        ('"unsigned", octets = 2', '"fraction", octets = 9', 17, "channel.1.sample.octets", "1 to 8"),
+        ('"unsigned", octets = 2', '"long-integer", octets = 8', 17, "channel.1.sample.octets", "9 to 255"),
+        ('"unsigned", octets = 2', '"long-fraction", octets = 8', 17, "channel.1.sample.octets", "9 to 255"),
+        ('"unsigned", octets = 2', '"time-of-day", octets = 4', 17, "channel.1.sample.octets", "has 8 octets"),
         ('model = "unsigned"', 'model = "int"', 17, "channel.1.sample.model", "unsigned"),
         ('modes = ["trigger"]', "modes = []", 18, "channel.1.sampling.modes", "at least one"),
         ('modes = ["trigger"]', 'modes = ["triger"]', 18, "channel.1.sampling.modes", "triger"),
@@ -315,6 +344,8 @@ def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:
         ('title = "Force"', "title = 3", 1, "title", "quotes"),
         ('title = "Force"', 'links = ["usb"]', 1, "links", "usb"),
         ('title = "Force"', f'name = "{"x" * 121}"', 1, "name", "120 octets"),
+        ('title = "Force"', f'name = "{"ä" * 61}"', 1, "name", "120 octets"),
+        ('name = "force"', f'name = "{"ä" * 61}"', 6, "channel.1.name", "120 octets"),
     ],
 )
 def test_a_mistake_is_named_with_file_line_and_field(
@@ -645,6 +676,15 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         ),
         ("[channel.1.calibration]\nmethod = 'cubic'\n", 'channel.1.calibration.method: "cubic" is no method; linear, '),
         ("[channel.1.calibration]\nrequired = 1\n", "channel.1.calibration.required: "),
+        ("[channel.1.calibration]\ndegree = 0\n", "channel.1.calibration.degree: the degree of a polynomial goes"),
+        ("[channel.1.calibration]\ndegree = 13\n", "channel.1.calibration.degree: the degree of a polynomial goes"),
+        ("[firmware]\nminimum = '1.2'\n", 'firmware.minimum: "1.2" is not a version such as 1.2.0'),
+        ("[firmware]\nminimum = '1.2.0+4294967296'\n", 'firmware.minimum: "1.2.0+4294967296" is not a version'),
+        ("[firmware]\nminimum = '1.2.65536'\n", 'firmware.minimum: "1.2.65536" is not a version such as'),
+        ("[firmware]\nbad = ['1.2.0', '1.02.0']\n", 'firmware.bad: "1.02.0" is neither a version'),
+        ("[firmware]\nbad = ['1.2.0', '1.2.0+07']\n", 'firmware.bad: "1.2.0+07" is neither a version'),
+        ("[firmware]\nbad = ['1.2.\u0663']\n", 'firmware.bad: "1.2.\u0663" is neither a version'),
+        (f"[firmware]\nbad = ['{'a' * 63}']\n", 'firmware.bad: "aaaa'),
         (
             "[channel.1-1]\ncalibration-key = 'none'\n[channel.1.calibration]\nrequired = true\n",
             'channel.1-1.calibration-key: "none" contradicts calibration.required = true.',
@@ -661,6 +701,10 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         ("[[text]]\nkind = 'title'\n", "text[0].xml: the text is missing."),
         (
             "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'deu'\n",
+            "text[0].language: a language has two letters, like",
+        ),
+        (
+            "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'd1'\n",
             "text[0].language: a language has two letters, like",
         ),
         (

@@ -16,7 +16,7 @@ from typing import Any, Final, Generic, TypeVar, overload
 from teds_provision.arrays import Floats, NDArray, np, without_repeats
 from teds_provision.errors import BadDataError
 from teds_provision.sanitize import counted
-from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
+from teds_provision.teds.calibration.model import MAXIMUM_DEGREE, Calibration, CalibrationInput, Method
 
 _Value = TypeVar("_Value")
 
@@ -186,7 +186,6 @@ def evaluate(calibration: Calibration, *inputs: object) -> object:
 
 
 Points = Sequence[tuple[float, float]]
-MAXIMUM_DEGREE = 12
 MAXIMUM_NODES = 8000  # 8 octets of coefficients each, in one tuple of at most 65,535 octets
 
 

@@ -25,6 +25,8 @@ Method = Literal["linear", "polynomial", "table", "steps"]
 Monotone = Literal["increasing", "decreasing", "either"]
 METHODS: Final[tuple[Method, ...]] = ("linear", "polynomial", "table", "steps")
 """Names of the codes of field 135 (house profile), in order."""
+MAXIMUM_DEGREE: Final = 12
+"""Highest degree of a polynomial that is fitted to points."""
 MONOTONE: Final[tuple[Monotone, ...]] = ("increasing", "decreasing", "either")
 """Names of the codes 1 to 3 of field 137 (house profile)."""
 

@@ -11,7 +11,9 @@ from teds_provision.teds.profile.reader import Section
 
 Release = tuple[int, int, int, int]
 """Major, minor, patch, build."""
-_VERSION: Final = re.compile(r"(\d{1,3})\.(\d{1,3})\.(\d{1,5})(?:\+(\d{1,10}))?")
+_NUMBER: Final = "(0|[1-9][0-9]{0,9})"
+_VERSION: Final = re.compile(rf"{_NUMBER}\.{_NUMBER}\.{_NUMBER}(?:\+{_NUMBER})?")
+"""As a report is spelled, which is compared with it: without leading zeros."""
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _HIGHEST: Final = (0xFF, 0xFF, 0xFFFF, 0xFFFFFFFF)
 

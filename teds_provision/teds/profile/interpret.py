@@ -6,7 +6,7 @@ import re
 from typing import Final, cast
 
 from teds_provision.errors import BadDataError
-from teds_provision.teds.calibration.model import METHODS, Monotone
+from teds_provision.teds.calibration.model import MAXIMUM_DEGREE, METHODS, Monotone
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.profile.firmware import firmware_demand
@@ -216,6 +216,8 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
     if method and method not in METHODS:
         part.error("method", f'"{method}" is no method; {", ".join(METHODS)} are.')
     degree = part.read(Key("degree", "", KeyKind.U8, "degree of the polynomial"))
+    if isinstance(degree, int) and not 1 <= degree <= MAXIMUM_DEGREE:
+        part.error("degree", f"the degree of a polynomial goes from 1 to {MAXIMUM_DEGREE}, not {degree}.")
     seconds = _interval(part)
     part.unit = unit
     deviation = part.read(Key("standard-deviation", "", KeyKind.NUMBER, "standard deviation in the channel's unit"))
@@ -387,6 +389,6 @@ def _text(part: Section, channels: tuple[int, ...]) -> TextProfile | None:
         part.error("channel", f"the type has no channel {number}.")
     if not text:
         part.error("xml", "the text is missing.")
-    if len(language) != 2 or not language.isascii():
+    if len(language) != 2 or not (language.isascii() and language.isalpha()):
         part.error("language", f'a language has two letters, like "en", not "{language}".')
     return TextProfile(TEXT_CLASSES[kind], number, text, language)
