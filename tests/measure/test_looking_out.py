@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -270,6 +270,82 @@ def test_a_node_that_starts_often_is_believed_again_ten_seconds_later(monkeypatc
     assert [looks._believes(words) for _ in range(BELIEVED + 1)] == [True] * BELIEVED + [False]
     now[0] += EACH
     assert looks._believes(words)
+
+
+class Heard:
+    """A discovery without its thread and its bus; ``course`` is what it did because of Announces."""
+
+    def __init__(self, poll: float | None, awaited: bool, welcome: bool) -> None:
+        self.course = list[object]()
+        made = self.looks = CanDiscovery.__new__(CanDiscovery)
+        made._awaited, made._announcers, made._asked_at, made._poll = {}, deque(maxlen=239), {}, poll
+        presence: Any = SimpleNamespace(
+            announced=lambda place, announce: self.course.append((place, announce.address)),
+            is_awaited=lambda _announce: awaited,
+            is_welcome=lambda _announce: welcome,
+        )
+        port: Any = SimpleNamespace(place="can:x")
+        made._presence, made.port = presence, port
+        made._ask_one = lambda address, *_seconds, **_more: self.course.append(address)  # type: ignore[method-assign]
+
+    def hear(self, data: str, identifier: int = 0x1CFF0021) -> float:
+        return self.looks._heard(Frame(identifier, bytes.fromhex(data)))
+
+
+@pytest.mark.parametrize(
+    ("poll", "awaited", "welcome", "soon", "course", "queued"),
+    [
+        (None, False, False, math.inf, [("can:x", 0x21)], []),
+        (30.0, False, False, math.inf, [("can:x", 0x21)], [0x21]),
+        (30.0, True, True, 0.05, [("can:x", 0x21)], []),
+        (30.0, False, True, math.inf, [("can:x", 0x21), 0x21], []),
+        (None, False, True, math.inf, [("can:x", 0x21), 0x21], []),
+    ],
+)
+def test_what_an_announce_leads_to_and_that_one_of_a_pressed_button_leads_to_nothing(
+    poll: float | None, awaited: bool, welcome: bool, soon: float, course: list[object], queued: list[int]
+) -> None:
+    """Nobody claims, asks or subscribes because of a pressed button (wire.md, "CAN")."""
+    for data, identifier in (
+        ("01 02 aabbccdd 01 00", 0x1CFF0021),
+        ("02 02 aabbccdd 00 00", 0x1CFF0021),
+        ("01 02 aabbccdd 00", 0x1CFF0021),
+        ("01 02 aabbccdd 00 00", 0x1CFF2021),
+    ):
+        silent = Heard(poll, awaited, welcome)
+        assert silent.hear(data, identifier) == math.inf
+        assert (silent.course, list(silent.looks._announcers)) == ([], [])
+    heard = Heard(poll, awaited, welcome)
+    assert heard.hear("01 02 aabbccdd 00 00") == soon
+    assert (heard.course, list(heard.looks._announcers)) == (course, queued)
+    heard.hear("01 02 aabbccdd 00 00")
+    assert list(heard.looks._announcers) == queued, "an address has one turn, however often it announces itself"
+
+
+def test_those_who_announce_themselves_are_asked_each_in_10_s_and_all_in_a_fifth_of_a_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(discovery, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    heard = Heard(30.0, awaited=False, welcome=False)
+    looks, course = heard.looks, heard.course
+    for at, announced, asked in (
+        (100.0, [1, 2, 3], [1]),
+        (100.15, [], []),
+        (100.25, [], [2]),
+        (100.5, [1, 2], [3]),
+        (109.0, [], []),  # both were asked within 10 s, and have lost their turn
+        (109.75, [1, 4], [4]),
+        (110.0, [2, 1], [1]),
+        (111.0, [2], [2]),
+        (111.1, [5], []),
+        (111.25, [], [5]),
+    ):
+        now[0] = at
+        looks._announcers.extend(announced)
+        course.clear()
+        looks._ask_announcer()
+        assert course == asked, at
 
 
 def test_the_pause_begins_again_once_no_node_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

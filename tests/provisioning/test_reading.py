@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from teds_provision.errors import BadDataError, GarbledError, NodeRefusedError
@@ -128,6 +130,67 @@ def test_an_image_has_four_mebibytes_at_most(monkeypatch: pytest.MonkeyPatch) ->
     teds_read.read_image(node, listed=[(0, 1), (0, 2)])  # type: ignore[arg-type]
     with pytest.raises(BadDataError, match=r"^The node lists more than 4 MiB of TEDS\.$"):
         teds_read.read_image(node, listed=[(0, 1), (0, 2), (0, 3)])  # type: ignore[arg-type]
+
+
+class Paced:
+    """Mock of a link that can ask for frames apart; ``gaps`` are those of each request."""
+
+    def __init__(self) -> None:
+        self.gap, self.gaps = 0, list[int]()
+
+
+def in_between(answers: dict[tuple[int, int], bytes], link: Paced, wrong: int = 0) -> tuple[Image | None, int]:
+    """Read in between; return the image and how often others had their turn. ``wrong`` is added to offsets."""
+    node = Lister(dict(answers))
+
+    def request(command: Command, what: str) -> bytes:
+        link.gaps.append(link.gap)
+        reply = node.request_idempotent(command, what)
+        listed = what == "to list its TEDS"
+        return reply if listed else (int.from_bytes(reply[:4], "big") + wrong).to_bytes(4, "big") + reply[4:]
+
+    node.request, node.contact = request, SimpleNamespace(link=link)  # type: ignore[attr-defined]
+    reading, turns = teds_read.read_in_between(node, gap=7), 0  # type: ignore[arg-type]
+    while True:
+        try:
+            next(reading)
+            turns += 1
+        except StopIteration as done:
+            return done.value, turns
+
+
+def test_read_in_between_each_request_has_its_turn_and_its_gap() -> None:
+    link = Paced()
+    image, turns = in_between({(0, 1): LONG, (0, 12): NAME, (1, 3): b"abc"}, link)
+    assert image is not None
+    assert image.blocks == {(0, 1): LONG, (0, 12): NAME, (1, 3): b"abc"}
+    assert turns == len(link.gaps) - 1 == 3 + 1 + 2, "List is asked at once; an end is an empty segment"
+    assert (set(link.gaps), link.gap) == ({7}, 0)
+
+
+@pytest.mark.parametrize(("block", "most"), [(SECURITY, LARGEST_SECURITY), ((0, 1), 1 << 20), ((1, 128), 1 << 20)])
+def test_read_in_between_a_teds_of_too_many_octets_or_from_another_offset_is_refused(
+    block: tuple[int, int], most: int
+) -> None:
+    link = Paced()
+    image, _ = in_between({block: (most - 4).to_bytes(4, "big")}, link)
+    assert image is not None
+    assert image.blocks[block] == (most - 4).to_bytes(4, "big"), "as many octets as there are"
+    with pytest.raises(BadDataError, match=f"claims {most + 1} octets, which is too many"):
+        in_between({block: (most - 3).to_bytes(4, "big")}, link)
+    with pytest.raises(GarbledError, match="from a different offset"):
+        in_between({block: NAME}, link, wrong=1)
+    assert link.gap == 0
+
+
+def test_read_in_between_an_image_has_four_mebibytes_at_most_with_what_is_claimed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(teds_read, "LARGEST_IMAGE", len(NAME) + 100)
+    image, _ = in_between({(0, 1): NAME, (0, 12): (96).to_bytes(4, "big")}, Paced())
+    assert image is not None
+    with pytest.raises(BadDataError, match="too many"):
+        in_between({(0, 1): NAME, (0, 12): (97).to_bytes(4, "big")}, Paced())
 
 
 def test_an_identify_of_another_node_is_noise_and_one_in_a_session_is_kept() -> None:

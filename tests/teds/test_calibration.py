@@ -273,6 +273,40 @@ def test_a_foreign_calibration_is_bad_data_and_nothing_else() -> None:
         from_decoded(foreign, channel=1)
 
 
+@pytest.mark.parametrize(
+    ("inputs", "coefficients", "method"),
+    [
+        ([(1, 1, 2)], 2, "linear"),
+        ([(1, 2, 2)], 3, "polynomial"),
+        ([(1, 0, 2)], 1, "polynomial"),
+        ([(1, 0, 3)], 2, "steps"),
+        ([(1, 1, 3)], 4, "table"),
+        ([(1, 2, 3)], 6, "polynomial"),
+        ([(1, 1, 2), (2, 1, 2)], 4, "polynomial"),
+        ([(1, 1, 3), (2, 1, 2)], 8, "polynomial"),
+    ],
+)
+def test_of_a_calibration_without_the_house_fields_the_formula_says_the_method(
+    inputs: list[tuple[int, int, int]], coefficients: int, method: str
+) -> None:
+    """What is not stated is not there: no unit but that of SI, no zero, no limits, no date."""
+    fields: list[tuple[str, object]] = [
+        ("CalInput", {"ChanNum": channel, "Degree": degree, "Boundaries": range(edges), "Offsets": range(edges - 1)})
+        for channel, degree, edges in inputs
+    ]
+    fields.append(("Coefs", range(coefficients)))
+    found = from_decoded(teds.decode(teds.compose(5, fields)), channel=1, units=parse_unit("rad").units)
+    assert found.method == method
+    assert [(part.channel, part.degree, len(part.boundaries), part.key) for part in found.inputs] == [
+        (*part, 0) for part in inputs
+    ]
+    assert (found.unit.scale, found.unit.offset, found.unit.units) == (1.0, 0.0, parse_unit("rad").units)
+    assert (found.zero_offset, found.low_limit, found.high_limit, found.uncertainty) == (0.0, None, None, None)
+    assert (found.date, found.interval, found.zeroed, found.monotone, found.raw_range) == (None,) * 5
+    half = from_decoded(teds.decode(teds.compose(5, [*fields, ("SIConvrt", {"Slope": 0.5})])), channel=1)
+    assert (half.unit.scale, half.unit.offset) == (0.5, 0.0)
+
+
 @given(st.binary(max_size=200))
 def test_any_octets_of_a_calibration_teds_give_a_calibration_or_bad_data(block: bytes) -> None:
     from teds_provision.teds.codec.frame import frame
