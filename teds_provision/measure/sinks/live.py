@@ -351,16 +351,14 @@ class TopicSink(ThreadedSink):
             last = stamp
             self._array(topic, stamp, names, rows.value[k].tolist())
             if self._joints:
-                self._joint_states(stamp, dict(zip(rows.channels, rows.value[k].tolist(), strict=True)))
+                self._joint_states(rows.group, stamp, dict(zip(rows.channels, rows.value[k].tolist(), strict=True)))
             self._array(f"{topic}/age", stamp, names, rows.age[k].tolist())
             self._went(int(np.isfinite(rows.value[k]).sum()), messages=2)
         self._arrays[rows.channels] = last
 
-    def _joint_states(self, stamp: float, values: Mapping[tuple[str, int], float]) -> None:
+    def _joint_states(self, group: str, stamp: float, values: Mapping[tuple[str, int], float]) -> None:
         self._newest |= values
-        mine = [
-            joint for joint in self._joints if any((joint.uuid, number) in values for number in joint.state.values())
-        ]
+        mine = [joint for joint in self._joints if joint.uuid == group] if self._station.each_node else self._joints
         names, *states = state_of(mine, self._newest)
         if names:
             self._array(self._topics.of_station(STATES), stamp, names, *states)

@@ -850,3 +850,45 @@ def test_a_recording_pauses_on_a_full_disk_or_quota_until_a_mebibyte_is_free_and
     assert "The system clock was set forward by 50.000 s" in last
     assert "# started: 2026-11-18T11:07:30" in last, "by the clock as it is now"
     assert [row["arm/elbow raw"] for row in rows(last)] == ["1", "2", "3"], "what was learned meanwhile counts"
+
+
+@pytest.mark.parametrize(("suffix", "comma"), [("csv", ","), ("txt", "\t")])
+def test_lines_of_a_text_file_are_held_whole(tmp_path: Path, suffix: str, comma: str) -> None:
+    """Microseconds, three digits of a bound, twelve of a value; cells of other nodes and of what is not known empty."""
+    path = tmp_path / f"run.{suffix}"
+    plus = replace(ANGLE, node="+arm", name='a "b"')
+    record(
+        path,
+        [
+            block([[10], [20]], [[1 / 3], [9.0]], [[True], [False]], index=7, clock_error=0.00012345),
+            block([[-5]], [[2e-7]], uuid=HAND, channels=(2,), clock_error=None, start=1_795_000_000.1234567),
+        ],
+        facts=[plus, FORCE],
+    )
+    cells = [
+        ["time", "uuid", "index", "clock_error", "note", '"\'+arm/a ""b"" [rad]"', "hand/force [N]",
+         '"\'+arm/a ""b"" raw"', "hand/force raw"],
+        ["1795000000.070000", ARM, "7", "0.000123", "", "0.333333333333", "", "10", ""],
+        ["1795000000.080000", ARM, "8", "0.000123", "", "", "", "20", ""],
+        ["1795000000.123457", HAND, "0", "", "", "", "2e-07", "", "-5"],
+    ]  # fmt: skip
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    assert lines == [comma.join(line) for line in cells]
+
+
+@pytest.mark.parametrize("sign", "=+-@")
+def test_no_name_begins_as_a_formula_of_a_spreadsheet(tmp_path: Path, sign: str) -> None:
+    record(tmp_path / "run.csv", [block()], facts=[replace(ANGLE, node=f"{sign}arm")])
+    [head] = [line for line in (tmp_path / "run.csv").read_text().splitlines() if line.startswith("time")]
+    assert head.split(",")[5:] == [f"'{sign}arm/angle [rad]", f"'{sign}arm/angle raw"]
+
+
+@pytest.mark.parametrize(
+    ("marks", "note"),
+    [({"unsigned": True}, "unsigned datasheet"), ({"unverified": True}, "unverified datasheet"), ({}, "")],
+)
+def test_a_line_by_a_datasheet_that_is_not_signed_is_marked(tmp_path: Path, marks: dict[str, bool], note: str) -> None:
+    """Whichever of the channels of the line it is."""
+    second = replace(ANGLE, number=2, name="other", **marks)
+    record(tmp_path / "run.csv", [block([[1, 2]], channels=(1, 2))], facts=[ANGLE, second])
+    assert [row["note"] for row in rows((tmp_path / "run.csv").read_text())] == [note]

@@ -247,6 +247,7 @@ class Carrier(TopicSink):
         self.arrays: list[tuple[str, float, list[str], list[float]]] = []
         self.scalars: list[tuple[str, str, float, float]] = []
         self.frames: set[str] = set()
+        self.frame_of_a_vector = ""
         self.joints: list[tuple[list[str], list[float], list[float], list[float]]] = []
         self.compounds: list[tuple[str, str, Mapping[str, FieldValue]]] = []
         self.words: dict[str, str] = {}
@@ -279,6 +280,7 @@ class Carrier(TopicSink):
     def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
         self.compounds.append((topic, kind, fields))
         self.frames.add(frame)
+        self.frame_of_a_vector = frame
 
     def _latched(self, topic: str, words: str) -> None:
         self.words[topic] = words
@@ -339,6 +341,10 @@ def test_each_channel_has_its_own_frame_and_the_deviation_of_its_profile() -> No
     base = [replace(facts, frame="base") for facts in axes("m/s^2", 4)]
     sink = carried([block([[1, 2, 3, 4]], channels=(1, 4, 5, 6))], facts=[tip, *base])
     assert sink.frames == {"arm_tip", "base"}
+    apart = [replace(facts, frame=f"axis_{facts.number}") for facts in base]
+    vector = carried([block([[2, 3, 4]], channels=(4, 5, 6))], facts=apart)
+    [(_, kind, _)] = vector.compounds
+    assert (kind, vector.frame_of_a_vector) == ("sensor_msgs/Imu", "axis_4"), "that of its first channel"
     [angle] = [pair for pair in sink.scalars if pair[0] == "/bench/arm/angle"]
     assert angle[3] == pytest.approx(0.002**2), "the standard deviation goes before the worst case"
 
@@ -366,6 +372,23 @@ def test_a_gripper_is_a_joint_whose_state_goes_out_and_whose_set_points_come_in(
     sink._joint_command(["hand"], [float("nan")], [], [])
     assert [(command.uuid, command.channel, command.value) for command in came] == [(HAND, 1, 0.02)]
     assert sink.refused_commands == 3
+
+
+@pytest.mark.parametrize("each_node", [False, True])
+def test_the_set_point_that_was_applied_is_the_state_of_a_joint_without_a_sensor(each_node: bool) -> None:
+    """It had no state at all, unless another of its sensors was of a joint, too."""
+    actuator, *_ = gripper()
+    warm = replace(FORCE, name="motor", units=parse_units("K"))
+    station = replace(STATION, each_node=each_node)
+
+    def row(stamp: float, group: str, key: tuple[str, int]) -> GroupRows:
+        value = np.array([[3.0]])
+        return GroupRows(group if each_node else "crane", (key,), np.array([stamp]), value, 0 * value)
+
+    applied = replace(block([[7]], [[0.05]], uuid=HAND), stream=255)
+    items = [row(1.0, HAND, (HAND, 2)), applied, row(2.0, ARM, (ARM, 1)), row(3.0, HAND, (HAND, 2))]
+    sink = carried(items, facts=[ANGLE, actuator, warm], station=station)
+    assert sink.joints == [(["hand"], [0.05], [], [])] * (1 if each_node else 2), "with the rows of its own node"
 
 
 @pytest.mark.parametrize(
