@@ -391,6 +391,23 @@ def test_of_a_batch_the_message_that_came_soonest_after_its_samples_is_told_to_t
     assert told == [(630, 1_090), (630, 1_210)]
 
 
+@pytest.mark.parametrize(
+    ("kind", "n", "last"), [(StreamKind.PERIODIC, 5, 4 * MS), (StreamKind.FREE, 5, 0), (StreamKind.EVENT, 1, 0)]
+)
+def test_a_message_came_after_its_last_instant_and_of_a_stream_that_runs_free_the_first_alone_is_certain(
+    kind: StreamKind, n: int, last: int
+) -> None:
+    told: list[tuple[int, int]] = []
+    plan = StreamPlan.for_channels(0, ((1, 2),), n=n, period=MS, kind=kind)
+    receiver: Any = SimpleNamespace(plan=plan)
+    clock: Any = SimpleNamespace(arrival=lambda tick, at: told.append((tick, at)))
+    other: Any = None
+    heard = ReceivedStream(receiver, other, other, clock, other, other)
+    message: Any = SimpleNamespace(tick=700)
+    heard._note_arrival([(b"", 9_000)], [message])
+    assert told == [(700 + last, 9_000)]
+
+
 def test_a_period_of_less_than_half_or_more_than_twice_the_asked_one_is_a_gap_or_a_fault() -> None:
     """A sensor that stood still for a second would date what comes next as if it took a second for each sample."""
     interpreter = Scene(StreamKind.FREE).heard.interpreter

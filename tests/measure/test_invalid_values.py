@@ -124,6 +124,24 @@ def test_the_age_of_a_block_counts_from_its_last_instant(monkeypatch: pytest.Mon
     np.testing.assert_allclose(block.time - 1.8e9, 1.003 + np.arange(6) / 1000, atol=1e-5)
 
 
+def test_the_clock_error_of_a_block_holds_the_hosts_too_and_a_clock_that_lies_has_none() -> None:
+    """operation.md section 5: the bound of an exchange of 2 ms is 1 ms and its step; a lie marks the data."""
+    plan = StreamPlan.for_channels(0, ((1, 2), (2, 2)), n=N, period=MS)
+    clock, host = ClockMap(), HostClock(WallClock(1.8e9))
+    heard = StreamInterpreter(SHEET, plan, 1, clock, host, MonotonicStamps())
+    good = [(LOW, LOW)] * N
+    errors = []
+    clock.arrival(10**9, 2 * 10**9)
+    errors.append(heard.blocks([message(0, *good)])[0].clock_error)
+    clock.exchange(Exchange(2 * 10**9, 2 * 10**9 + 2 * MS, 10**9 + MS, 10**9 + MS, 1000, 20))
+    errors.append(heard.blocks([message(1, *good)])[0].clock_error)
+    host.apart = 0.0005
+    errors.append(heard.blocks([message(2, *good)])[0].clock_error)
+    clock.lie = "its clock was set"
+    errors.append(heard.blocks([message(3, *good)])[0].clock_error)
+    assert errors == [None, pytest.approx(0.001, rel=0.1), pytest.approx(0.0015, rel=0.1), None]
+
+
 @pytest.mark.parametrize(("raw", "dtype"), [(2**53 - 1, "float64"), (2**53 + 1, "object"), (2**63 + 1, "object")])
 def test_raw_values_of_different_forms_stay_exact(raw: int, dtype: str) -> None:
     """A Float32 beside an integer of 8 octets: from 2^53 on, a Float64 would change it."""

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import pytest
 
+from teds_provision.errors import GarbledError
 from teds_provision.protocol.messages import tables
-from teds_provision.protocol.messages.frames import decode_reply
+from teds_provision.protocol.messages.frames import TedsStatus, decode_list, decode_reply
 
 STATUS = "attributes:u8 status:u8 size:u32 checksum:u16 max_size:u32"
 SEGMENT = "offset:u32 octets:octets"
@@ -166,3 +167,40 @@ def test_modes_of_the_commands_are_not_the_capabilities_of_the_teds() -> None:
 def test_a_reply_has_failed_if_its_flag_is_0_alone(flag: int, ok: bool) -> None:
     reply = decode_reply(bytes([flag, 0, 2, 7, 8]))
     assert (reply.ok, reply.payload) == (ok, b"\7\10")
+
+
+@pytest.mark.parametrize("reply", ["", "01", "0100", "010000ff", "010001", "010002ff", "000001"])
+def test_a_reply_whose_length_does_not_count_its_octets_is_garbled(reply: str) -> None:
+    assert decode_reply(bytes.fromhex("010000")).payload == b""
+    with pytest.raises(GarbledError):
+        decode_reply(bytes.fromhex(reply))
+
+
+def test_a_query_reply_has_twelve_octets_in_the_order_of_the_standard() -> None:
+    octets = bytes.fromhex("50 01 0000001d faf5 00000100")
+    status = TedsStatus(attributes=0x50, size=29, checksum=0xFAF5, max_size=256, status=1)
+    assert TedsStatus.decode(octets) == status
+    assert status.encode() == octets
+    for wrong in (octets[:-1], octets + b"\0", b""):
+        with pytest.raises(GarbledError):
+            TedsStatus.decode(wrong)
+
+
+@pytest.mark.parametrize(
+    ("payload", "found"),
+    [
+        ("", []),
+        ("0000 01 0000 80 0001 03 ffff ff", [(0, 1), (0, 128), (1, 3), (65535, 255)]),
+        ("0000 01 0000", None),
+        ("0000 01 0000 01", None),
+        ("0000 80 0000 01", None),
+        ("0001 01 0000 03", None),
+    ],
+)
+def test_a_list_has_each_teds_once_ascending(payload: str, found: list[tuple[int, int]] | None) -> None:
+    octets = bytes.fromhex(payload)
+    if found is not None:
+        assert decode_list(octets) == found
+        return
+    with pytest.raises(GarbledError):
+        decode_list(octets)

@@ -262,8 +262,8 @@ def test_tokens_are_new_each_time_and_marks_are_held_against_the_frame() -> None
     assert len(first.octets) == 8
     assert first.arm(Action.STOP, 5).commitment == first.commitment != other.commitment
     seen = TickBounds(START, START + MS)
-    assert mark_is_honest(START, seen)
-    assert not mark_is_honest(START + MS + 1, seen)
+    marks = (START - 1, START, START + MS, START + MS + 1)
+    assert [mark_is_honest(mark, seen) for mark in marks] == [False, True, True, False]
 
 
 # -- Drive -------------------------------------------------------------------------------------------------------------
