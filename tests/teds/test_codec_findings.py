@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import tracemalloc
+from fractions import Fraction
 
 import pytest
 
@@ -163,6 +165,64 @@ def test_an_extension_octet_of_80_means_none() -> None:
     assert isinstance(units, teds.Units)
     assert units.extension == 0
     assert teds.recompose(teds.decode(with_80)) == with_80
+
+
+PACKED = "00 80 80 84 82 7a 7e 80 80 80"
+"""Volt: m² kg s⁻³ A⁻¹."""
+
+
+@pytest.mark.parametrize(
+    ("spelling", "extension"),
+    [
+        (PACKED, 0),
+        (f"{PACKED} 00", 0),
+        (f"{PACKED} 80", 0),
+        (f"{PACKED} 0f", 15),
+        (f"{PACKED} 81", 0x81),
+        ("320100 350184 360182 37017a 38017e", 0),
+        ("320100 350184 360182 37017a 38017e 3c0100", 0),
+        ("320100 350184 360182 37017a 38017e 3c0180", 0),
+        ("38017e 37017a 3c010f 360182 350184 320100", 15),
+    ],
+)
+@pytest.mark.parametrize("edition", EDITIONS)
+def test_units_are_read_in_each_spelling_in_both_fields_and_editions(
+    spelling: str, extension: int, edition: Edition
+) -> None:
+    units = bytes.fromhex(spelling)
+    volt = teds.Units(meters=2, kilograms=1, seconds=-3, amperes=-1, extension=extension)
+    head = bytes.fromhex("030400030101" if edition == 2007 else "030500ff030201")
+    decoded = teds.decode(frame(head + raw_tuple(12, units) + raw_tuple(19, raw_tuple(46, units))))
+    assert decoded.edition == edition
+    assert decoded.get("PhyUnits") == volt
+    [data_set] = [field for field in decoded.fields if field.name == "DataSet"]
+    assert [(child.name, child.value) for child in data_set.children] == [("SUnits", volt)]
+
+
+@pytest.mark.parametrize(
+    ("edition", "extension", "spelling"),
+    [
+        (2007, 0, "320101 390181"),
+        (2007, 15, "320101 390181 3c010f"),
+        (2024, 0, "01 80 80 80 80 80 80 81 80 80 00"),
+        (2024, 15, "01 80 80 80 80 80 80 81 80 80 0f"),
+    ],
+)
+def test_units_are_written_as_tuples_without_what_is_absent_or_packed_with_all(
+    edition: Edition, extension: int, spelling: str
+) -> None:
+    units = teds.Units(1, kelvins=Fraction(1, 2), extension=extension)
+    octets = teds.compose(3, {"PhyUnits": units, "DataSet": {"SUnits": units}}, edition=edition)
+    raw = bytes.fromhex(spelling)
+    assert raw_tuple(12, raw) in octets
+    assert raw_tuple(19, raw_tuple(46, raw)) in octets
+
+
+@pytest.mark.parametrize("missing", [None, math.nan, -math.nan])
+def test_what_is_not_available_is_written_as_the_one_nan_of_the_teds(missing: float | None) -> None:
+    assert bytes.fromhex("0d04 7fffffff") in teds.compose(3, {**CHANNEL, "LowLimit": missing})
+    assert bytes.fromhex("2608 7fffffff 3f800000") in teds.compose(3, {**CHANNEL, "DAngles": [missing, 1.0]})
+    assert bytes.fromhex("8108 3f800000 7fffffff") in teds.compose(5, {"Coefs": [1.0, missing]})
 
 
 def test_free_form_end_user_data_is_kept() -> None:
