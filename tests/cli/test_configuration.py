@@ -347,7 +347,12 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
         "backup": {"to": "office.pem"},
         "measure": {"to": ["run.csv", "mqtt:lab"]},
         "export-keys": {"to": "north"},
-        "ncap": {"brokers": {"lab": "mqtts://a@lab?password-file=secret/arm&ca=/etc/ca.pem"}},
+        "ncap": {
+            "brokers": {
+                "lab": "mqtts://a@lab?password-file=secret/arm&ca=/etc/ca.pem",
+                "office": "mqtts://office?ca=own/ca.pem&cert=arm.pem&key=../arm.key&qos=1",
+            }
+        },
     }
     folder = Path("/etc/teds")
     assert anchored(settings, folder) == {
@@ -357,6 +362,11 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
         "backup": {"to": "/etc/teds/office.pem"},
         "measure": {"to": ["/etc/teds/run.csv", "mqtt:lab"]},
         "export-keys": {"to": "north"},
-        "ncap": {"brokers": {"lab": "mqtts://a@lab?password-file=/etc/teds/secret/arm&ca=/etc/ca.pem"}},
+        "ncap": {
+            "brokers": {
+                "lab": "mqtts://a@lab?password-file=/etc/teds/secret/arm&ca=/etc/ca.pem",
+                "office": "mqtts://office?ca=/etc/teds/own/ca.pem&cert=/etc/teds/arm.pem&key=/etc/arm.key&qos=1",
+            }
+        },
     }
     assert anchored(anchored(settings, folder), Path("/elsewhere")) == anchored(settings, folder)

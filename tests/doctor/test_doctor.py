@@ -11,9 +11,10 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -389,6 +390,76 @@ def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:
     with Station.inspect(stationed.home) as store:
         store.audit("backup", None, "done")
     assert next(finding for finding in look(stationed, "store") if finding.name == "backup").result == "ok"
+
+
+@pytest.mark.parametrize(
+    ("ages", "result", "why"),
+    [
+        ((0,), "ok", "The last backup is 0 days old."),
+        ((1,), "ok", "The last backup is 1 day old."),
+        ((90,), "ok", "The last backup is 90 days old."),
+        ((91,), "warning", "The last backup is 91 days old."),
+        ((400, 5), "ok", "The last backup is 5 days old."),
+    ],
+)
+def test_a_backup_is_old_after_90_days_and_the_last_one_counts(
+    stationed: System, monkeypatch: pytest.MonkeyPatch, ages: tuple[int, ...], result: str, why: str
+) -> None:
+    for days in ages:
+        at = (datetime.now(UTC) - timedelta(days=days, minutes=1)).strftime("%Y-%m-%dT%H:%M:%SZ")
+        with monkeypatch.context() as patch, Station.inspect(stationed.home) as store:
+            patch.setattr("teds_provision.station.store.audit.utc_now", lambda at=at: at)
+            store.audit("backup", None, "done")
+    (backup,) = (finding for finding in look(stationed, "store") if finding.name == "backup")
+    fix = "" if result == "ok" else "teds-provision backup FILE"
+    assert (backup.result, backup.why, backup.fix) == (result, why, fix)
+
+
+@pytest.mark.parametrize(("free", "result"), [(64 << 20, "ok"), ((64 << 20) - 1, "warning")])
+def test_a_disk_with_less_than_64_mib_is_a_warning(
+    system: System, monkeypatch: pytest.MonkeyPatch, free: int, result: str
+) -> None:
+    """A home that is not there yet is made in the folder above it."""
+    asked: list[Path] = []
+
+    def usage(path: Path) -> SimpleNamespace:
+        asked.append(path)
+        return SimpleNamespace(free=free)
+
+    monkeypatch.setattr("teds_provision.doctor.station.shutil.disk_usage", usage)
+    (disk,) = look(replace(system, home=system.home / "below" / "it"), "disk")
+    assert (disk.result, disk.fix != "", asked) == (result, result != "ok", [system.home.parent])
+
+
+def test_a_home_of_another_user_is_a_warning(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 4711)
+    stationed.home.chmod(0o777)
+    home, *_ = look(stationed, "home")
+    assert (home.result, home.why) == ("warning", f"{stationed.home} belongs to another user.")
+
+
+@pytest.mark.parametrize(
+    ("mode", "result"),
+    [(0o700, "ok"), (0o720, "failed"), (0o702, "failed"), (0o740, "warning"), (0o704, "warning"), (0o710, "warning"),
+     (0o701, "warning")],
+)  # fmt: skip
+def test_a_home_is_closed_to_the_group_and_to_all_others(stationed: System, mode: int, result: str) -> None:
+    stationed.home.chmod(mode)
+    assert look(stationed, "home")[0].result == result
+
+
+@pytest.mark.parametrize(
+    ("name", "named"), [("store.sqlite3", True), ("vault-pkcs11.json", True), ("config.toml", False)]
+)
+@pytest.mark.parametrize("mode", [0o640, 0o604])
+def test_the_store_and_the_vault_are_closed_to_others_and_settings_need_not_be(
+    stationed: System, name: str, named: bool, mode: int
+) -> None:
+    path = stationed.home / name
+    path.touch()
+    path.chmod(mode)
+    found = {finding.name: finding for finding in look(stationed, "home")}
+    assert ("files" in found and name in found["files"].why) is named
 
 
 def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:

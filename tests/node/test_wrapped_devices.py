@@ -408,6 +408,56 @@ def test_iio_devices_that_cannot_be_wrapped(sysfs: Callable[..., Path], tmp_path
         require_match(SensorPlace("iio:bmp280"), [origin, origin], ["a", "b"])
 
 
+def edited(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Return the example's EDS with the last occurrence of each text replaced."""
+    text = EDS.read_text()
+    for old, new in changes:
+        before, found, after = text.rpartition(old)
+        assert found, old
+        text = f"{before}{new}{after}"
+    path = folder / "cell.eds"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("code", "bits", "signed"),
+    [
+        ("0x0001", 1, False), ("0x0002", 8, True), ("0x0004", 32, True), ("0x0005", 8, False), ("0x0006", 16, False),
+        ("0x0007", 32, False), ("0x0010", 24, True), ("0x0011", 64, None), ("0x0015", 64, True), ("0x0016", 24, False),
+        ("0x001B", 64, False),
+    ],
+)  # fmt: skip
+def test_a_canopen_object_has_the_bits_of_its_data_type(
+    tmp_path: Path, code: str, bits: int, signed: bool | None
+) -> None:
+    path = edited(tmp_path, ("DataType=0x0008", f"DataType={code}"))
+    found = canopen_device.read(path).channels[1]
+    assert (found.bits, found.is_float) == (bits, signed is None)
+    assert found.signed is bool(signed)
+
+
+def test_two_canopen_objects_of_one_name_and_a_factor_below_0(tmp_path: Path) -> None:
+    path = edited(tmp_path, ("ParameterName=temperature", "ParameterName=torque"), ("Factor=0.1", "Factor=-0.2"))
+    first, second = canopen_device.read(path).channels
+    assert (first.name, second.name) == ("Values.torque 6000.1", "Values.torque 6000.2")
+    assert (first.scale, first.limits) == (-0.2, (-400.0, 400.0))
+    path = edited(tmp_path, ("Factor=0.1", "Factor=-0.2"), ("HighLimit=2000", "HighLimit=500"))
+    assert canopen_device.read(path).channels[0].limits == (-100.0, 400.0)
+
+
+@pytest.mark.parametrize(
+    ("access", "mapping", "measured"),
+    [("ro", 1, True), ("rwr", 1, True), ("rw", 1, False), ("rww", 1, False), ("wo", 1, False), ("ro", 0, False)],
+)
+def test_an_object_in_no_pdo_is_measured_if_it_could_be_in_one_and_is_only_read(
+    tmp_path: Path, access: str, mapping: int, measured: bool
+) -> None:
+    path = edited(tmp_path, ("AccessType=ro\nPDOMapping=1", f"AccessType={access}\nPDOMapping={mapping}"))
+    names = [channel.name for channel in canopen_device.read(path).channels]
+    assert names == (["torque", "temperature"] if measured else ["torque"])
+
+
 def test_what_a_device_sends_by_default_is_measured_regardless_of_who_may_write_it(tmp_path: Path) -> None:
     path = tmp_path / "cell.eds"
     text = EDS.read_text()
