@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import sqlite3
@@ -14,9 +15,12 @@ from datetime import datetime
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
+import click
 import pytest
 
+from teds_provision.cli.options import tracing
 from teds_provision.cli.rendering import local_time
+from teds_provision.errors import LinkError
 from teds_provision.station.station import Station
 from teds_provision.station.store.audit import AuditFilter
 from teds_provision.station.store.store import Store
@@ -287,3 +291,28 @@ def test_a_trace_is_shown_line_by_line(home: Path, tmp_path: Path) -> None:
     assert frames == [records[1].as_json(), records[3].as_json()]
     path.write_bytes(record_lines.head())
     assert call(home, "trace", "show", path).out == "The trace is empty.\n"
+
+
+def test_a_command_whose_trace_is_incomplete_is_7_if_all_else_went_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_descriptor: int, _octets: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    def traced(name: str, *, fails: bool, error: Exception | None = None) -> None:
+        with monkeypatch.context() as patched, tracing(tmp_path / name) as trace:
+            assert trace is not None
+            if fails:
+                patched.setattr(os, "write", full)
+            trace.frame("can", "out", b"\2", identifier=1)
+            if error is not None:
+                raise error
+
+    traced("whole", fails=False)
+    with pytest.raises(click.exceptions.Exit) as ended:
+        traced("cut", fails=True)
+    assert ended.value.exit_code == 7
+    with pytest.raises(LinkError):
+        traced("both", fails=True, error=LinkError("The node is silent."))
+    with tracing(None) as none:
+        assert none is None

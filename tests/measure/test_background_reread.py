@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeSilentError
+from teds_provision.errors import BadDatasheetError, NodeSilentError
 from teds_provision.measure import background_reread
 from teds_provision.measure.background_reread import AGAIN, FIRST, PATIENCE, SPARING, TRIES, BackgroundReread
 
@@ -86,3 +87,52 @@ def test_nodes_that_begin_go_first_for_a_minute_and_one_node_of_a_bus_is_read_at
     scene.bus.reading.release()
     assert scene.run(60.0) is False
     assert scene.asked[0] - began >= FIRST + PATIENCE
+
+
+@pytest.mark.parametrize(
+    ("verdict", "mark", "same", "why"),
+    [
+        ("authentic", "", True, None),
+        ("authentic", "unsigned", True, None),
+        ("authentic", "", False, "another Security TEDS"),
+        ("unsigned", "unsigned", True, None),
+        ("unsigned", "unverified", True, None),
+        ("unsigned", "unsigned", False, "another Security TEDS"),
+        ("unsigned", "", True, "The signature is missing"),
+        ("not authentic", "", True, "The signature is missing"),
+        ("not authentic", "unsigned", True, "The signature is missing"),
+        ("unproven", "unverified", True, "The signature is missing"),
+    ],
+)
+def test_values_count_on_only_by_the_datasheet_that_they_were_calibrated_by(
+    monkeypatch: pytest.MonkeyPatch, verdict: str, mark: str, same: bool, why: str | None
+) -> None:
+    kept: list[tuple[Any, ...]] = []
+    results = [("passed", "It is trusted"), ("failed", "The signature is missing"), ("failed", "It is old")]
+    checks = [SimpleNamespace(result=result, why=text) for result, text in results if same or result == "passed"]
+
+    def keep(_station: Any, _node: Any, image: Any, *, by: str, floor: Any, c: int) -> Any:
+        kept.append((image, by, floor, c))
+        return SimpleNamespace(verified=SimpleNamespace(verdict=verdict, checks=checks))
+
+    monkeypatch.setattr(background_reread.readings, "keep", keep)
+    monkeypatch.setattr(background_reread, "freshness_floor_of", lambda _station, uuid, proven: (uuid, proven))
+    trusted = SimpleNamespace(
+        node=SimpleNamespace(proven="proof"),
+        sheet=SimpleNamespace(uuid=b"\x8d" * 10),
+        fingerprint=hashlib.sha256(b"security" if same else b"another").hexdigest(),
+        unsigned=mark == "unsigned",
+        unverified=mark == "unverified",
+    )
+    rest: Any = SimpleNamespace(_station=None, _verified=trusted, _by="ncap", _c=7, _began=1.8e9)
+    image: Any = SimpleNamespace(security=b"security")
+    if why is None:
+        BackgroundReread._conclude(rest, image)
+    else:
+        with pytest.raises(BadDatasheetError) as ended:
+            BackgroundReread._conclude(rest, image)
+        assert ended.value.message == (
+            f"The datasheet on the node is not the one used for the measurement: {why}. "
+            "Values recorded of it since 2027-01-15T08:00:00Z do not count."
+        )
+    assert kept == [(image, "ncap", (b"\x8d" * 10, "proof"), 7)], "its verdict is that of the whole station"
