@@ -8,10 +8,12 @@ from collections.abc import Sequence
 import pytest
 
 from teds_provision.errors import BadDataError, NoRoomError, PolicyError
+from teds_provision.links.ble.airtime import BleAirtime
 from teds_provision.links.can.airtime import CanAirtime
 from teds_provision.measure.planning import BusTime, NodePlans, period_of, plan_node, sensors_of
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.protocol.operation.subscription import most_instants
 from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
 
 BUS = BusTime(CanAirtime(1_000_000))
@@ -155,3 +157,17 @@ def test_a_message_holds_a_sample_at_least_and_a_sample_that_fits_none_is_refuse
     [plan] = plan_node(channels(0.1), BUS, kind=StreamKind.FREE, test_pattern=True, start=7).streams
     asked = plan.subscribe
     assert (asked.n, asked.kind, asked.test_pattern, asked.start) == (1, StreamKind.FREE, True, 7)
+
+
+@pytest.mark.parametrize(
+    ("mtu", "octets", "periodic", "event"), [(247, 240, 113, 1), (244, 240, 113, 1), (243, 239, 113, 1), (23, 19, 3, 0)]
+)
+def test_over_the_air_a_message_is_one_notification_of_mtu_less_4_octets_and_of_240_at_most(
+    mtu: int, octets: int, periodic: int, event: int
+) -> None:
+    """operation.md section 6, data sets of 2 octets: 113 of them at an MTU of 247, 3 at 23, where no event fits."""
+    air = BleAirtime(mtu)
+    assert (air.most_octets, BleAirtime().most_octets, air.frames(octets)) == (octets, 19, 1)
+    most = [most_instants(kind, 2, air.most_octets) for kind in (StreamKind.PERIODIC, StreamKind.EVENT)]
+    assert most == [periodic, event]
+    assert air.load(octets, 113, 100_000) == pytest.approx(88.5 / 160, rel=1e-3)
