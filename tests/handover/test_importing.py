@@ -5,22 +5,28 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision.errors import NodeRefusedError, NotAuthenticError, PolicyError
+from teds_provision.handover.deny import why_not
 from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
+from teds_provision.protocol.handover.bundle import BundledNode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.provisioning.agree import agree, reset_node
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.verify import snapshot_trust, snapshot_trust_of
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import TrustRecord
+from teds_provision.station.store.records import Holder, Tombstone, TrustRecord, WhitelistEntry
 from tests.bench import Board, make_station, talk
 from tests.handover.desk import Pair, everything, held, key_up, provisioned, session
+
+AT = "2026-11-28T08:00:00Z"
 
 
 def key_again(station, board):  # type: ignore[no-untyped-def]
@@ -260,3 +266,47 @@ def test_a_ninth_key_that_waits_for_its_proof_is_not_taken_in(pair: Pair) -> Non
         pair.south.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=bytes([number] * 8), epoch=1)
     with pytest.raises(PolicyError, match="8 of its keys are already waiting for proof here"):
         pair.take(path)
+
+
+def test_whose_statement_bans_a_node_here(pair: Pair) -> None:
+    """Its holders, whom it was given to, who is certified by the CA that it keeps, and who brings it: no one else."""
+    south, uuid, key, other = pair.south, bytes(range(10)), SoftwareKey(31), SoftwareKey(32)
+    pinned, signer, ca = fingerprint(SoftwareKey(33).point), fingerprint(key.point), SoftwareKey(34)
+    south.policy.trust(TrustRecord("lab", "station", key.point, signer))
+    brought = BundledNode(uuid, SoftwareKey(33).point, bytes(16), 1)
+
+    def why(by: str = signer, key: str | None = None, *nodes: BundledNode, sender: str = "") -> str:
+        statement: Any = SimpleNamespace(uuid=uuid, fingerprint=key, statement="a ban", sender=by)
+        bundle: Any = SimpleNamespace(nodes=nodes, sender=sender)
+        return why_not(south, statement, bundle)
+
+    assert why() == "this node is unknown here"
+    south.pins.put(WhitelistEntry(uuid, pinned, assurance="tap"))
+    nobody = f"station {signer[:32]} has no authority over this node"
+    assert why() == nobody
+    assert why(south.fingerprint) == why(signer, None, brought, sender=signer) == ""
+    assert why(signer, None, brought, sender="5c" * 32) == nobody, "another one's bundle"
+    assert why(signer, None, replace(brought, uuid=bytes(10)), sender=signer) == nobody, "it brings another node"
+
+    south.keys.put_holder(Holder(uuid, signer, AT), Holder(bytes(10), fingerprint(other.point), AT))
+    assert (why(), why(signer, pinned)) == ("", "")
+    assert why(signer, "cd" * 32) == f"it names the key {'cd' * 16}, and the node here has another"
+    assert why(fingerprint(other.point)).endswith("has no authority over this node"), "it holds another node's key"
+    another = replace(brought, node_key=other.point)
+    assert why(signer, pinned, another) == "", "the key that it is pinned to goes before the one that comes"
+    assert "has another" in why(signer, fingerprint(other.point), another)
+    south.keys.remove_holder(uuid, signer)
+    assert why() == nobody
+
+    south.policy.put_tombstone(Tombstone(uuid, signer, "h", AT))
+    assert why() == ""
+    assert why(fingerprint(other.point)).endswith("has no authority over this node"), "it went to another station"
+    south.policy.take_back([uuid])
+    assert why() == nobody
+
+    south.identity.put_certificate(fingerprint(ca.point), signer, bytes(64))
+    assert why() == nobody, "the node keeps another CA"
+    south.keys.set_ca_of(uuid, ca.point)
+    assert why() == ""
+    south.policy.distrust("lab")
+    assert why() == nobody

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.measure import sample_series, sampling
+from teds_provision.measure.capture import _point
 from teds_provision.measure.clock import ClockMap, Exchange, WallClock
-from teds_provision.measure.sample_series import require_still, take_samples_of
+from teds_provision.measure.sample_series import SampleSeries, require_still, take_samples_of
 from teds_provision.measure.sampling import Sample, shown_json
 from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.measure.zero import ZeroOrder, _ZeroRun
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.operation.commands import SampleReply
-from teds_provision.teds.calibration import Calibration, CalibrationInput, fit
+from teds_provision.teds import Sheet
+from teds_provision.teds.calibration import Calibration, CalibrationInput, ChannelInterpreter, fit
+from teds_provision.teds.calibration.points import Point
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.calibration.zero import SampleStatistics
 from teds_provision.teds.units import parse_unit
@@ -111,6 +118,60 @@ def test_a_reading_is_still_within_its_uncertainty_or_else_a_hundredth_of_its_ra
         return
     with pytest.raises(PolicyError, match=f"Channel 3 is not steady: its reading {words}"):
         require_still(series)
+
+
+TEMPERATURE = sheet_of("temperature-sensor", {1: replace(fit([(0, -40.0), (21120, 125.0)], "linear", channel=1),
+                                                         unit=parse_unit("degC"))})  # fmt: skip
+TURNING = sheet_of("magnetic-angular-position-sensor", {1: replace(fit([(0, 0.0), (65536, 360.0)], "linear", channel=1),
+                                                                   unit=parse_unit("degree"))})  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("sheet", "value", "unit", "wanted"),
+    [
+        (TEMPERATURE, 20.0, "degC", 20.0),
+        (TEMPERATURE, 293.15, "K", 20.0),
+        (TEMPERATURE, -40.4, "degC", -40.4),  # the stated uncertainty is 0.5 K
+        (TEMPERATURE, -40.6, "degC", None),
+        (TEMPERATURE, 125.4, "degC", 125.4),
+        (TEMPERATURE, 125.6, "degC", None),
+        (TURNING, 450.0, "degree", 450.0),  # a turn has no end
+        (TURNING, -math.pi, "rad", -180.0),
+    ],
+)
+def test_the_value_that_a_zero_asks_for_is_within_the_limits_in_any_unit(
+    sheet: Sheet, value: float, unit: str, wanted: float | None
+) -> None:
+    channel = sheet.channels[0]
+    assert channel.calibration is not None
+    run: Any = SimpleNamespace(order=ZeroOrder(1, value, unit, shown_unit_asked=False))
+    if wanted is not None:
+        assert _ZeroRun._wanted(run, channel, channel.calibration) == pytest.approx(wanted)
+        return
+    with pytest.raises(PolicyError, match=r"exceeds the limits of channel 1 \(temperature\), -40 degC to 125 degC"):
+        _ZeroRun._wanted(run, channel, channel.calibration)
+
+
+@pytest.mark.parametrize(
+    ("sheet", "raws", "why"),
+    [
+        (TURNING, [100, 104], ""),
+        (TURNING, [0, 65535], "is at the wrap of its raw values"),
+        (TURNING, [0, 32800], "is at the wrap of its raw values"),
+        (TURNING, [0, 32700], "is not steady"),
+        (TURNING, [100, 400], "is not steady"),  # the stated uncertainty is 1 degree, 182 raw values
+        (TEMPERATURE, [0, 21120], "is not steady"),
+        (sheet_of("magnetic-angular-position-sensor"), [100, 400], ""),  # nothing to read it by
+        (sheet_of("magnetic-angular-position-sensor"), [0, 65535], "is at the wrap of its raw values"),
+    ],
+)
+def test_samples_of_one_place_give_a_point(sheet: Sheet, raws: list[int], why: str) -> None:
+    series = SampleSeries(ChannelInterpreter(sheet, 1), np.array(raws, dtype=np.uint64), {})
+    if not why:
+        assert _point(series, 1.5) == Point(1, sum(raws) / 2, 1.5, (raws[1] - raws[0]) / 2, 2)
+        return
+    with pytest.raises(PolicyError, match=why):
+        _point(series, 1.5)
 
 
 def test_a_sample_is_shown_with_what_is_known_of_it() -> None:

@@ -36,11 +36,12 @@ from teds_provision.provisioning.batch_sheet import (
     worse,
     write_report,
 )
-from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.build import BuildOrder, named_for, prepare
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord, WhitelistEntry
+from teds_provision.teds.image import Image
 from tests.bench import Board, contact
 from tests.pace import PATIENCE
 
@@ -594,6 +595,56 @@ def test_a_name_is_no_other_nodes_and_a_pattern_may_be_of_many_rows(station: Sta
     with pytest.raises(BadDataError) as caught:
         read(station, tmp_path, f"uuid,name\n{board_of(1).hex()},taken\n")
     assert caught.value.message == f"boards.csv:2: node {board_of(9).hex()} already has the name 'taken'."
+
+
+@pytest.mark.parametrize(
+    ("mine", "others", "pattern", "name"),
+    [
+        (None, (), "cell {n}", "cell 1"),
+        (None, ("cell 1", "cell 3"), "cell {n}", "cell 2"),
+        ("cell 3", ("cell 1",), "cell {n}", "cell 3"),  # its own, though 2 is free
+        ("cell 3", (), "joint {n}", "joint 1"),
+        ("cell x", (), "cell {n}", "cell 1"),
+        ("cell 3", (), "cell {n}{n}", "cell 11"),
+        ("old", ("cell 1",), "cell {n} {uuid}", f"cell 1 {'01' * 10}"),
+    ],
+)
+def test_a_node_keeps_its_number_and_a_new_one_gets_the_first_that_is_free(
+    station: Station, mine: str | None, others: tuple[str, ...], pattern: str, name: str
+) -> None:
+    station.nodes.put(NodeRecord(board_of(1), name=mine))
+    for number, other in enumerate(others, 2):
+        station.nodes.put(NodeRecord(board_of(number), name=other))
+    named = named_for(station, board_of(1), prepare(station, BuildOrder(profile="load-cell", name=pattern)))
+    assert named.order.name == name
+
+
+@pytest.mark.parametrize(
+    ("keystore", "at_once"), [("file", 6), ("keyring", 6), ("pkcs11:token=x?module-path=/x.so", 1)]
+)
+def test_boards_of_a_bus_are_worked_on_one_at_a_time_if_a_token_holds_the_key(
+    station: Station, monkeypatch: pytest.MonkeyPatch, keystore: str, at_once: int
+) -> None:
+    run = BatchRun(station, LinkSettings("can"), ProvisionRequest(whole_bus=True), SilentReporter())
+    monkeypatch.setattr(type(station.identity), "keystore", keystore)
+    assert run._at_once(SixAtOnce()) == at_once  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "missing"), [((), "1, 3"), ((1,), "3"), ((3,), "1"), ((2,), "1, 3"), ((1, 3), None)]
+)
+def test_a_board_that_lacks_a_calibration_of_any_channel_has_not_passed(
+    station: Station, calibrated: tuple[int, ...], missing: str | None
+) -> None:
+    (station.home / "profiles").mkdir()
+    required = "".join(f"[channel.{number}.calibration]\nrequired = true\n" for number in (1, 3))
+    (station.home / "profiles" / "hand.toml").write_text(f'extends = "gripper"\n{required}')
+    order = BuildOrder(profile="hand")
+    run = BatchRun(station, LinkSettings("can"), ProvisionRequest(order=order, whole_bus=True), SilentReporter())
+    error = run._lacks_calibration(board_of(1), Image(board_of(1), {(number, 5): b"x" for number in calibrated}))
+    assert (error is None) == (missing is None)
+    if error is not None:
+        assert f"has no calibration of channel {missing}, which its type requires" in error.message
 
 
 def test_a_calibration_lies_beside_the_sheet_and_may_be_of_one_channel_and_is_checked_before(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration import Calibration, CalibrationInput, evaluate, from_decoded
-from teds_provision.teds.calibration.zero import offset_for, reading_of, turn_of, with_zero_offset
+from teds_provision.teds.calibration.zero import SampleStatistics, offset_for, reading_of, turn_of, with_zero_offset
 from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from teds_provision.teds.units import parse_unit
 
@@ -50,6 +50,22 @@ def test_a_drift_shows_that_hides_in_the_spread() -> None:
     falls = reading_of(np.linspace(1, 0, 32))
     assert falls.drift == pytest.approx(-0.516, abs=1e-3)
     assert falls.is_unstable(0.4), "whichever way it moves"
+
+
+@pytest.mark.parametrize(
+    ("mean", "spread", "count", "doubt"),
+    [
+        (0.0, 0.2, 36, 0.1),
+        (0.0, 0.2, 144, 0.05),
+        (0.0, 0.0, 32, 0.0),
+        (-2097152.0, 0.2, 36, 1.1),
+        (2097152.0, 0.0, 36, 1.0),
+    ],
+)
+def test_a_mean_is_good_to_three_standard_errors_and_four_steps_of_a_float32(
+    mean: float, spread: float, count: int, doubt: float
+) -> None:
+    assert SampleStatistics(mean, spread, 0.0, count).doubt == pytest.approx(doubt)
 
 
 @given(st.floats(0, 360), st.floats(0, 3), st.integers(16, 64))
