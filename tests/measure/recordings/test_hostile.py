@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadDataError, TedsProvisionError
+from teds_provision.measure.recordings import source
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.sinks.mcap.writer import CHUNK, CHUNK_HEAD, HEADER, MAGIC, record, text
@@ -52,6 +54,7 @@ def refused(path: Path, *words: str) -> None:
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,9999999999999999999,4,5\n",
          [":2:", "too large"]),
         (b"# teds-provision measurement, text 1\n\xff\xfe\n", [":2:", "UTF-8"]),
+        (b"# teds-provision measurement, text 1\n" + b"1" * (9 << 20), [":2:", "more than 8388608 octets"]),
     ],
 )  # fmt: skip
 def test_what_is_no_recording_is_refused_with_its_place(tmp_path: Path, octets: bytes, words: list[str]) -> None:
@@ -78,6 +81,20 @@ def test_a_whole_number_that_no_float_can_hold_is_none(tmp_path: Path, line: str
     path.write_text('{"event":"recording","station":"x"}\n' + line % "2" + "\n")
     [entry] = filter(None, open_recording(path).entries())
     assert getattr(entry, member) == 2.0
+
+
+def test_channels_of_a_recording_are_counted_once_each_and_only_so_many_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(source, "MOST", replace(source.MOST, channels=2))
+    path = tmp_path / "run.jsonl"
+    lines = [f'{{"event":"channel","uuid":"ab","number":{number}}}' for number in (1, 2, 1, 2)]
+    path.write_text("\n".join(['{"event":"recording","station":"x"}', *lines, ""]))
+    assert set(open_recording(path).facts) == {("ab", 1), ("ab", 2)}
+    with path.open("a") as file:
+        file.write(lines[0].replace("1", "3") + "\n")
+    with pytest.raises(BadDataError, match="names more than 2 channels"):
+        list(open_recording(path).entries())
 
 
 def test_a_chunk_that_unpacks_to_gigabytes_is_refused_unopened(tmp_path: Path) -> None:
