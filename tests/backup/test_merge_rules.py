@@ -208,6 +208,8 @@ def test_a_key_comes_back_if_it_is_newer_than_all_that_is_known_here(
         (lambda s: s.datasheets.keep_draft(Draft(A, Image(A), created=AT)),
          lambda s: s.datasheets.keep_draft(Draft(A, Image(A), "signed", created=AT)),
          lambda s: s.datasheets.draft(A).stage == "signed"),
+        (lambda s: s.datasheets.put(Image(A, {(0, 1): b"a"})), lambda s: s.datasheets.put(Image(A, {(0, 1): b"b"})),
+         lambda s: [row.image.blocks[0, 1] for row in s.datasheets.whole_history(A)] == [b"b"]),
         (lambda s: s.pins.restore([WhitelistEntry(A, KEY, AT)]),
          lambda s: s.pins.restore([WhitelistEntry(A, KEY, AT, "tap")]), lambda s: s.pins.row(A).assurance == "tap"),
     ],
@@ -223,6 +225,23 @@ def test_a_row_that_both_have_is_replaced_by_that_of_a_newer_copy_alone(
         assert not read(two.live), how
     two.merged(NEWER)
     assert read(two.live)
+
+
+def test_a_datasheet_that_is_missing_here_comes_back_and_a_draft_unless_the_copy_is_older(two: Two) -> None:
+    for store in (two.live, two.copy):
+        store.nodes.restore(NODE)
+    two.copy.datasheets.put(Image(A, {(0, 1): b"a"}))
+    two.copy.datasheets.keep_draft(Draft(A, Image(A), created=AT))
+    for how, back in (
+        (OLDER, {"datasheets": 1}),
+        (SAME, {}),
+        (OTHER, {"drafts": 1}),
+        (NEWER, {}),
+    ):
+        assert dict(two.merged(how).back) == back, how
+    assert [row.image.blocks for row in two.live.datasheets.whole_history(A)] == [{(0, 1): b"a"}]
+    assert two.live.datasheets.drop_draft(A)
+    assert two.merged(NEWER).back["drafts"] == 1
 
 
 def test_a_flag_of_an_older_copy_comes_with_a_key_that_is_missing_here_alone(two: Two) -> None:
