@@ -106,6 +106,19 @@ def test_after_a_silence_no_more_points_come_at_once_than_in_a_fifth_of_a_second
     assert 10 <= len(times) <= POINTS / 5
 
 
+def test_a_test_pattern_and_a_block_without_samples_are_no_values() -> None:
+    live = Live()
+    live.join()
+    live.block(replace(block(0, 4, 0.01), test_pattern=True))
+    live.block(block(0, 0, 0.01))
+    assert live._gather(1.0) == {}
+    assert live.last("ab" * 10, 1) is None
+    assert not live.history._waiting
+    live.block(block(0, 4, 0.01))
+    assert len(live._gather(1.0)["ab" * 10 + "/1"][0]) == 4
+    assert live.last("ab" * 10, 1) is not None
+
+
 def block(first: int, count: int, period: float, channels: int = 1) -> Block:
     rows = np.arange(first, first + count)
     values = np.repeat(np.sin(rows * 0.1)[:, None], channels, axis=1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -12,9 +14,11 @@ import pytest
 from teds_provision.api.answers import Node
 from teds_provision.api.operations import document
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.directory import NodeDirectory
+from teds_provision.ncap.nodes.directory import NodeDirectory, channel_facts
 from teds_provision.provisioning.inventory import inventory
 from teds_provision.shapes.node import HINTS, PUBLISHED, KnownNode
+from teds_provision.teds.channel import Channel, ChannelKind, Timing
+from teds_provision.teds.units import parse_unit
 
 from ..bench import make_station
 from ..test_architecture import MODULES, name_of, parsed
@@ -75,3 +79,20 @@ def test_a_field_without_facts_is_of_the_command_line_alone() -> None:
 def schema() -> dict[str, Any]:
     found: dict[str, Any] = document()["components"]["schemas"]["Node"]["properties"]
     return found
+
+
+def test_what_the_api_says_of_a_channel_has_no_number_that_the_datasheet_lacks() -> None:
+    """SI units; the number that people see is the SI value times ``factor`` plus ``offset``."""
+    oil = Channel(
+        3, "oil", True, ChannelKind.SENSOR, parse_unit("degC").units, True, 233.15, 398.15, 0.5,
+        timing=Timing(period=0.05), display="degC",
+    )  # fmt: skip
+    found = channel_facts(oil)
+    assert found["shown"] == {"unit": "°C", "factor": 1.0, "offset": pytest.approx(-273.15)}
+    assert {name: found[name] for name in ("number", "name", "kind", "unit", "low", "high", "uncertainty", "rate")} == {
+        "number": 3, "name": "oil", "kind": "sensor", "unit": "K", "low": 233.15, "high": 398.15, "uncertainty": 0.5,
+        "rate": 20.0,
+    }  # fmt: skip
+    bare = channel_facts(replace(oil, low=math.nan, high=math.inf, timing=Timing(), kind=None))
+    assert (bare["low"], bare["high"], bare["rate"], bare["kind"]) == (None, None, None, None)
+    assert (bare["calibrated"], bare["due"], bare["overdue"]) == (None, None, False)
