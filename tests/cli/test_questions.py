@@ -355,3 +355,24 @@ def test_a_key_is_distrusted_and_a_ban_lifted_as_the_person_was_asked_or_not(
     assert call(home, "--json", "revoke", "--lift", UUID, "--dry-run").json["why"] == "cloned"
     assert not refused(["trust", "remove", "lab"])
     assert not refused(["revoke", "--lift", UUID])
+
+
+@pytest.mark.parametrize("words", [("trust", "remove", "lab"), ("revoke", "--lift", UUID)], ids=["trust", "ban"])
+def test_of_two_runs_at_once_the_later_one_has_nothing_to_do(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    """Both asked, and the other one was answered first: that is no error."""
+    (tmp_path / "lab.pem").write_text(to_pem(SoftwareKey(41).point))
+    call(home, "trust", "add", "lab", tmp_path / "lab.pem", "--yes")
+    call(home, "revoke", UUID, "--why", "lost", "--yes")
+    first = []
+
+    def confirm(_app: App, _question: str, *, yes: bool) -> None:
+        with monkeypatch.context() as same:
+            same.setattr(App, "confirm", lambda _app, _question, *, yes: None)
+            first.append(call(home, "--json", *words, "--yes"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(App, "confirm", confirm)
+        later = call(home, "--json", *words, "--yes")
+    assert [(done.code, done.json["fresh"]) for done in (*first, later)] == [(0, True), (0, False)]

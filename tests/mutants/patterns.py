@@ -2746,14 +2746,14 @@ PATTERNS = (
     Pattern(
         "the key that a person was asked about is distrusted",
         "remove",
-        "find_trusted(station, name) == record and plan_removal(station, record) == plan",
+        "current == record and plan_removal(station, record) == plan",
         "True",
         "tests/cli/test_questions.py",
     ),
     Pattern(
         "the ban that a person was asked about is lifted",
         "_lift",
-        "station.policy.revocation(uuid) == entry",
+        "current == entry",
         "True",
         "tests/cli/test_questions.py",
     ),

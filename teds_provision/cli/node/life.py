@@ -67,19 +67,28 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
 
 def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
     entry = station.policy.revocation(uuid)
-    result: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
     if entry is None:
-        app.emit(result, f"Nothing to do: node {uuid.hex()} is not revoked here.")
+        _print_not_revoked(app, uuid)
         return
+    result: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why, "fresh": True}
     if dry_run:
         app.emit({**result, "plan": True}, f"Plan: lift the ban on {uuid.hex()}: {entry.why}")
         return
     station.unlock()
     app.confirm(f"Lift the ban on node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
     with station.lock("revoke --lift", app.note):
-        require_same(station.policy.revocation(uuid) == entry)
+        current = station.policy.revocation(uuid)
+        if current is None:  # the same command, run at the same time, was first
+            _print_not_revoked(app, uuid)
+            return
+        require_same(current == entry)
         deny.lift(station, uuid)
     app.emit(result, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
+
+
+def _print_not_revoked(app: App, uuid: bytes) -> None:
+    result = {"lifted": uuid.hex(), "why": None, "fresh": False}
+    app.emit(result, f"Nothing to do: node {uuid.hex()} is not revoked here.")
 
 
 @command("teds-provision decommission 8d4d --yes --via can --can udp_multicast:239.74.163.2")

@@ -180,13 +180,8 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     the nodes that keep them; bans that it issued are lifted.
     """
     station = app.station()
-    try:
-        record = find_trusted(station, name)
-    except NotFoundError:
-        before = find_removed(station, name)
-        if before is None:
-            raise
-        _print_removed(app, station, before)
+    record = _trusted_until_now(app, station, name)
+    if record is None:
         return
     plan = plan_removal(station, record)
     result: dict[str, Any] = {"trusted": _trusted(station), "removed": _record(record), "ends": _ends(plan)}
@@ -199,10 +194,25 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     app.confirm(f"Stop trusting the {text}?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
-        require_same(find_trusted(station, name) == record and plan_removal(station, record) == plan)
+        current = _trusted_until_now(app, station, name)
+        if current is None:  # the same command, run at the same time, was first
+            return
+        require_same(current == record and plan_removal(station, record) == plan)
         done = handover_trust.remove(station, record)
     result |= {"trusted": _trusted(station), "ends": _ends(done)}
     app.emit(result, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
+
+
+def _trusted_until_now(app: App, station: Station, name: str) -> TrustRecord | None:
+    """Return the trusted key, None if it was removed before, which is printed. Raises NotFoundError if it never was."""
+    try:
+        return find_trusted(station, name)
+    except NotFoundError:
+        before = find_removed(station, name)
+        if before is None:
+            raise
+    _print_removed(app, station, before)
+    return None
 
 
 def _trusted(station: Station) -> list[dict[str, str]]:
