@@ -125,3 +125,20 @@ def test_slow_bodies_without_a_token_keep_no_client_out_and_end_no_connection(
         assert await answer(browser, KNOWN) == b"HTTP/1.1 200 OK\r\n"
 
     served(work)
+
+
+def test_of_clients_with_a_token_the_one_that_was_silent_longest_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest connection was closed, though its client had asked a moment ago."""
+    monkeypatch.setattr(server, "MOST", 3)
+
+    async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
+        oldest, silent = await connect(), await connect()
+        for pair in (oldest, silent, oldest):
+            assert await answer(pair, KNOWN) == b"HTTP/1.1 200 OK\r\n"
+            await pair[0].readuntil(b"\r\n\r\n")
+        third = await connect()
+        assert await answer(third, KNOWN) == b"HTTP/1.1 200 OK\r\n"
+        assert await is_ended(silent)
+        assert await answer(oldest, KNOWN) == b"HTTP/1.1 200 OK\r\n"
+
+    served(work)

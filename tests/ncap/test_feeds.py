@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -12,6 +13,8 @@ from teds_provision.errors import NodeBusyError, NotFoundError, UsageError
 from teds_provision.ncap.nodes import simulation, virtual
 from teds_provision.ncap.nodes.simulation import MOST_OCTETS, SIMULATION, CheckedLines, FedChannel, Feed, Pace
 from teds_provision.ncap.nodes.virtual import Virtual, Virtuals
+from teds_provision.ncap.web import simulation as web_simulation
+from teds_provision.ncap.web.simulation import _Session
 from teds_provision.node.sources.base import SourceChannel
 
 ONE, OTHER = "ab" * 10, "cd" * 10
@@ -113,6 +116,39 @@ def test_of_a_line_the_simulation_learns_why_it_is_skipped_or_which_value_is_lim
     limit = f"{limited}; the sensor gives the nearer limit" if limited else ""
     assert checked.check(line.encode()) == (skipped, limit)
     assert checked.limited == (2 if limited else 1)
+
+
+def test_the_first_line_of_either_kind_is_reported_at_once_and_the_others_of_that_kind_once_a_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Lines that were skipped all the time held up what there was to say about limited values."""
+    now, sent = [100.0], list[dict[str, Any]]()
+
+    async def send(found: dict[str, Any]) -> None:
+        sent.append(found)
+
+    monkeypatch.setattr(web_simulation, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    nothing: Any = None
+    session = _Session(cast("Any", SimpleNamespace(send_json=send)), nothing, [], nothing)
+
+    def at(moment: float, skipped: str, limited: str) -> list[dict[str, Any]]:
+        sent.clear()
+        now[0] = moment
+        session.skipped.note(skipped)
+        session.limited.note(limited)
+        asyncio.run(session._send_news())
+        return sent.copy()
+
+    assert at(100.0, "", "") == []
+    assert at(100.1, "no JSON", "") == [{"skipped": 1, "why": "no JSON"}]
+    assert at(100.2, "no JSON", "too far") == [{"limited": 1, "why": "too far"}]
+    assert at(101.0, "NaN", "too far") == []
+    assert at(101.15, "", "") == [{"skipped": 3, "why": "NaN"}]
+    assert at(101.25, "NaN", "farther") == [{"limited": 3, "why": "farther"}]
+    assert at(102.15, "NaN", "farther") == [{"skipped": 5, "why": "NaN"}]
+    assert at(102.25, "NaN", "") == [{"limited": 4, "why": "farther"}]
+    assert at(110.0, "", "") == [{"skipped": 6, "why": "NaN"}]
+    assert at(120.0, "", "") == []
 
 
 def test_a_simulation_is_sent_the_range_of_a_channel_that_has_one() -> None:

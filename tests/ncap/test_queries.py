@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import asyncio
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from starlette.applications import Starlette
 from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
 
 from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, TedsProvisionError, UsageError
 from teds_provision.ncap.nodes.update_actions import UpdateRequest
 from teds_provision.ncap.web import app, clause12, metrics, resources
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError, _require_may_change
+from teds_provision.ncap.web.resources import Resources
 
 
 def request(query: str = "", *headers: tuple[str, str]) -> Request:
@@ -101,6 +105,34 @@ def test_a_change_without_a_body_is_a_delete_of_no_octets() -> None:
     assert refused("POST", content_type=json) is None
     assert refused("POST", content_type=json, content_length=str((1 << 20) + 1)) == 413
     assert refused("GET", content_length=str((1 << 20) + 1)) == 413
+
+
+def test_a_number_of_thousands_of_digits_is_refused_and_no_bug() -> None:
+    """Python reads no such number, so the answer was 500."""
+    number, known = "7" * 5000, SimpleNamespace(known=lambda text: text, directory=SimpleNamespace(channel=_numbered))
+
+    def status(path: str, query: str, *routes: Route) -> tuple[int, bytes]:
+        sent: list[Any] = []
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        scope = {"type": "http", "method": "GET", "path": path, "query_string": query.encode(), "headers": []}
+        handlers: Any = {TedsProvisionError: lambda _request, error: Response(error.message, 422)}
+        called = Starlette(routes=routes, exception_handlers=handlers)
+        asyncio.run(called({**scope, CALLER: Caller("arm", "script")}, cast("Any", None), send))
+        return sent[0]["status"], sent[1]["body"]
+
+    there = Resources(cast("Any", known)).routes()
+    assert status("/nodes/hand/channels/255", "", *there) == (200, b'{"number":255}')
+    assert status(f"/nodes/hand/channels/{number}", "", *there)[0] == 404
+    old = Clause12(cast("Any", known)).routes()
+    asked = "responseFormat=text&tedsType=1&channelId="
+    assert status("/1451/TEDSManager/ReadTeds", f"{asked}{number}", *old) == (200, b"3\nchannelId must be a number.\n")
+
+
+def _numbered(_uuid: str, number: int) -> dict[str, int]:
+    return {"number": number}
 
 
 def test_names_of_clause_12_are_separated_by_commas_alone_and_a_module_keeps_its_number() -> None:

@@ -90,7 +90,7 @@ class Virtuals:
         self._all: dict[str, Virtual] = {}
         self._port = free_port()
         for folder in sorted(self._home.glob("*/")):
-            with suppress(OSError, ValueError, KeyError):
+            with suppress(OSError, ValueError, KeyError, TypeError):
                 facts = json.loads((folder / _FACTS).read_text())
                 one = Virtual(facts["uuid"], facts["name"], facts["source"], folder, facts["channels"])
                 self._all[one.uuid] = one

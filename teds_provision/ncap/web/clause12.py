@@ -23,6 +23,7 @@ from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.web.responses import reading
 from teds_provision.sanitize import printable
 
+_DIGITS: Final = 5  # of a number; Python raises an error for four thousand
 NO_ERROR, NO_SUCH, NO_VALUE, BAD_ARGUMENT, FAILED = 0, 1, 2, 3, 4
 Fields = dict[str, Any]
 
@@ -134,7 +135,7 @@ class Clause12:
 
 def _integer(given: dict[str, str], name: str) -> int:
     word = given.get(name.lower(), "")
-    if not word.isdecimal() or int(word) > 0xFFFF:
+    if not word.isdecimal() or len(word) > _DIGITS or int(word) > 0xFFFF:
         raise UsageError(f"{name} must be a number.")
     return int(word)
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -46,8 +47,17 @@ Handler = Callable[[Request], Awaitable[Response]]
 _LENT_LOOK: Final = 0.5
 _STILL: Final = client.LETTING_GO / 3  # seconds between two lines to a command that waits for a node
 _OF_UPDATES: Final = ("nodes", "match", "dry_run", "other_board", "allow_downgrade", "parallel", "wait")
-_DIGITS: Final = 9  # of a number in a query; Python raises an error for four thousand
+_DIGITS: Final = 9  # of a number in a query or a path; Python raises an error for four thousand
 _UNIX: Final = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
+
+
+class _ShortInteger(IntegerConvertor):
+    """A number in a path; the library's own raises an error for four thousand digits."""
+
+    regex = f"[0-9]{{1,{_DIGITS}}}"
+
+
+register_url_convertor("short_integer", _ShortInteger())
 
 
 class Resources:
@@ -68,7 +78,7 @@ class Resources:
             Route("/nodes/{uuid}/teds", self.teds, methods=["GET", "PUT"]),
             Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
             Route("/nodes/{uuid}/locate", self.locate, methods=["POST"]),
-            Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["GET", "PUT"]),
+            Route("/nodes/{uuid}/channels/{number:short_integer}", self.channel, methods=["GET", "PUT"]),
             Route("/updates", self.updates, methods=["GET", "POST"]),
             Route("/updates/{id}", self.update, methods=["GET", "DELETE"]),
             Route("/groups", self.groups, methods=["GET", "POST"]),

@@ -37,28 +37,31 @@ class HttpConnection(H11Protocol):
     """uvicorn's, with an end to its patience."""
 
     _began = 0.0
+    _heard = 0.0
     _awaited: Any = None
     _late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Handle a new connection: wait for the head of its first request."""
         super().connection_made(transport)
-        self._began = time.monotonic()
+        self._began = self._heard = time.monotonic()
         self._await()
         if len(self.connections) >= MOST:
             self._make_room()
 
     def _make_room(self) -> None:
-        """End the oldest idle connection."""
+        """End the oldest connection without a good token, else the one that has been silent longest."""
         mine = [
             connection
             for connection in self.connections
             if isinstance(connection, HttpConnection) and connection is not self
         ]
         strangers = [http_connection for http_connection in mine if not http_connection.is_known]
-        useless = strangers or [http_connection for http_connection in mine if http_connection.is_silent]
-        if useless:
-            min(useless, key=lambda http_connection: http_connection._began).end()
+        silent = [http_connection for http_connection in mine if http_connection.is_silent]
+        if strangers:
+            min(strangers, key=lambda http_connection: http_connection._began).end()
+        elif silent:
+            min(silent, key=lambda http_connection: http_connection._heard).end()
         else:
             self.limit_concurrency = MOST  # all connections have a running request: reply 503
 
@@ -69,6 +72,7 @@ class HttpConnection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Handle a piece of a request."""
+        self._heard = time.monotonic()
         super().data_received(data)
         self._await()
 

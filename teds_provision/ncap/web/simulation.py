@@ -84,11 +84,12 @@ async def _connected(virtual: Virtual) -> tuple[asyncio.StreamReader, asyncio.St
 
 @dataclass
 class _News:
-    """Lines that were refused: how many, why last, and whether the simulation knows it."""
+    """Lines that were refused: how many, why last, and how many of them the simulation knows, since when."""
 
     count: int = 0
     why: str = ""
     sent: int = 0
+    at: float = 0.0
 
     def note(self, why: str) -> None:
         """Count one."""
@@ -156,15 +157,12 @@ class _Session:
         await self.writer.drain()
 
     async def _send_news(self) -> None:
-        """Report the first line that was not taken as it came at once, and the others once a second."""
+        """Report the first line of either kind at once, and the others of that kind once a second."""
         now = time.monotonic()
         for name, news in (("skipped", self.skipped), ("limited", self.limited)):
-            if news.count > news.sent and (not news.sent or now - self._told >= _NEWS):
-                news.sent = news.count
-                self._told = now
+            if news.count > news.sent and (not news.sent or now - news.at >= _NEWS):
+                news.sent, news.at = news.count, now
                 await self.socket.send_json({name: news.count, "why": news.why})
-
-    _told: float = 0.0
 
     async def _act(self, reader: asyncio.StreamReader) -> None:
         """Send what actuators are set to, until the node's process ends."""
