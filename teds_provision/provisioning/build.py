@@ -698,6 +698,21 @@ def pending_image(station: Station, uuid: bytes, has: Image | None) -> Image | N
     return image
 
 
+def unwritten_draft(station: Station, has: Image | None, wanted: Image) -> tuple[str, ...]:
+    """Return a warning if the node has a draft that was never written and has other content than ``wanted``.
+
+    ``has`` is what the node has now. Who writes ``wanted`` leaves that draft where it is.
+    """
+    pending, draft = pending_image(station, wanted.uuid, has), station.datasheets.draft(wanted.uuid)
+    if pending is None or draft is None or pending.unsigned_blocks() == wanted.unsigned_blocks():
+        return ()
+    node, profile = wanted.uuid.hex(), f" as {draft.profile}" if draft.profile else ""
+    return (
+        f"Node {node} has a draft ({draft.stage}{profile}) that was never written; it is kept, and is no part of this"
+        f" datasheet. To drop it: teds-provision draft drop {node}",
+    )
+
+
 def _sequence(image: Image | None) -> int:
     octets = image.security if image is not None else None
     try:

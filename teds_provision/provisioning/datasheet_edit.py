@@ -12,7 +12,7 @@ from teds_provision.errors import BadDataError, DatasheetChangedError
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.board_type import differences, require_board_type, topic_warnings
-from teds_provision.provisioning.build import own_name, require_fit, teds_calibrations
+from teds_provision.provisioning.build import own_name, require_fit, teds_calibrations, unwritten_draft
 from teds_provision.provisioning.calibration_guard import guard
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.progress import DONE, NOTHING, Reporter, StepResult, Steps
@@ -96,6 +96,7 @@ def plan_sheet(
     require_fit(same, present.image, image)
     warnings = guard(station, image, present.image, accept_calibration, record=record)
     warnings += topic_warnings(station, present.image, image)
+    warnings += unwritten_draft(station, present.image, image)
     changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
     return SheetPlan(image, changes, warnings, present)
 
@@ -155,7 +156,7 @@ def write_sheet(
             epoch=present.identity.epoch,
             node_sequence=present.identity.sequence,
             on_node=on_node,
-            keep_draft=True,
+            keep_draft=not unwritten_draft(station, present.image, plan.image),
             before=lambda: require_not_measured(station, node),
         )
         step.result = NOTHING if signed.reused else DONE

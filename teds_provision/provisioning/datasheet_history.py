@@ -8,7 +8,10 @@ from teds_provision.errors import NotFoundError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.board_type import differences, is_remembered
+from teds_provision.provisioning.build import unwritten_draft
 from teds_provision.provisioning.calibration_guard import guard
+from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.sign import require_not_measured, sign
 from teds_provision.provisioning.teds_read import take_snapshot
@@ -47,12 +50,16 @@ def history_of(station: Station, node: str) -> tuple[bytes, list[DatasheetRecord
 
 @dataclass(frozen=True)
 class RestoredDatasheet:
-    """An older datasheet, signed again and written; for a dry run ``written`` is None."""
+    """An older datasheet, signed again and written; for a dry run ``written`` is None.
+
+    ``warnings`` names a draft that was not written and is kept.
+    """
 
     uuid: bytes
     sequence: int
     changes: tuple[Change, ...]
     written: WriteResult | None
+    warnings: tuple[str, ...] = ()
 
 
 def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
@@ -66,27 +73,53 @@ def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
     )
 
 
-def restore_datasheet(
-    station: Station, links: LinkSettings, node: str, sequence: int, reporter: Reporter, *, dry_run: bool = False
-) -> RestoredDatasheet:
-    """Write a datasheet that the node had under ``sequence``, signed again; its content counts, not its number.
+@dataclass(frozen=True)
+class RestoreOrder:
+    """The order to write the datasheet that ``node`` had under ``sequence``, or only to plan it.
 
-    Raises NotFoundError (no such datasheet), PolicyError, and what ``write`` raises.
+    ``retyped``: the board may become one of another type; ``jump``: its sequence may go far ahead.
     """
-    uuid = station.nodes.resolve(node)
+
+    node: str
+    sequence: int
+    retyped: bool = False
+    jump: bool = False
+    dry_run: bool = False
+
+
+def restore_datasheet(
+    station: Station, links: LinkSettings, order: RestoreOrder, reporter: Reporter, *, operator: Operator
+) -> RestoredDatasheet:
+    """Sign an older datasheet of a node again and write it; its content counts, not its number.
+
+    ``operator`` is asked as by :func:`~teds_provision.provisioning.write.write_at`. A draft of other content that was
+    never written is kept, with a warning. Raises NotFoundError (no such datasheet), PolicyError, and what ``write``
+    raises.
+    """
+    sequence = order.sequence
+    uuid = station.nodes.resolve(order.node)
     station.policy.require_whitelisted(uuid)
     record = _record_of(station, uuid, sequence)
-    if dry_run:
+    if order.dry_run:
         now = station.datasheets.datasheet(uuid)
         before = now.unsigned_blocks() if now is not None else {}
-        return RestoredDatasheet(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
+        changes = tuple(diff_blocks(before, record.image.unsigned_blocks()))
+        return RestoredDatasheet(uuid, sequence, changes, None, unwritten_draft(station, now, record.image))
+    if order.jump:
+        operator.jump("This uses up the node's sequence numbers up to that point, permanently. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always", writes="write") as visit:
         require_session(station, visit.node)
         present = take_snapshot(visit.node)
         blocks = record.image.unsigned_blocks()
         same = {block for block, teds in blocks.items() if present.image.blocks.get(block) == teds}
         image = Image(uuid, {**blocks, **present.fixed_beside(same)})
+        if not order.retyped:
+            retype = differences(present.image.blocks, image)
+            known = record.profile is not None and is_remembered(station, uuid, record.profile, factory=False)
+            if retype and not known:
+                operator.retype(uuid, retype)
         guard(station, image, present.image, f"datasheet of sequence {sequence} brought back")
+        warnings = unwritten_draft(station, present.image, image)
         changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
         signed = sign(
             station,
@@ -95,10 +128,19 @@ def restore_datasheet(
             epoch=present.identity.epoch,
             node_sequence=present.identity.sequence,
             on_node=present.image.security if not changes else None,
-            keep_draft=True,
+            keep_draft=not warnings,
             profile=record.profile,
             before=lambda: require_not_measured(station, visit.node, released=visit.released),
         )
         facts = {"profile": record.profile} if record.profile is not None else {}
-        written = write(station, visit.node, signed.image, present=present, progress=reporter.written, facts=facts)
-        return RestoredDatasheet(uuid, signed.sequence, changes, written)
+        written = write(
+            station,
+            visit.node,
+            signed.image,
+            present=present,
+            progress=reporter.written,
+            facts=facts,
+            jump=order.jump,
+            low=operator.low_battery,
+        )
+        return RestoredDatasheet(uuid, signed.sequence, changes, written, warnings)

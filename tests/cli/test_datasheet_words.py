@@ -15,6 +15,7 @@ from teds_provision.cli.station import trust as trust_commands
 from teds_provision.errors import NoNodeError
 from teds_provision.handover.trust import Removal
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
+from teds_provision.provisioning.datasheet_history import RestoreOrder
 from teds_provision.provisioning.write import WriteResult
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import DatasheetRecord, Draft, TrustRecord
@@ -148,7 +149,9 @@ def test_what_write_prints(home: Path, tmp_path: Path, stand_in: Any) -> None:
 def test_what_an_earlier_datasheet_prints(home: Path, stand_in: Any) -> None:
     known(home)
     changes = (SimpleNamespace(text="the name changes"),)
-    restored = SimpleNamespace(uuid=UUID, sequence=9, changes=changes, written=WriteResult(21, 1.0, IMAGE))
+    restored = SimpleNamespace(
+        uuid=UUID, sequence=9, changes=changes, written=WriteResult(21, 1.0, IMAGE), warnings=("a draft is kept",)
+    )
     work = stand_in(provisioning.datasheet_history, "restore_datasheet", restored)
     people, found = both(home, "write", NODE, "--from", "3", *NFC)
     assert people.out == (
@@ -157,12 +160,16 @@ def test_what_an_earlier_datasheet_prints(home: Path, stand_in: Any) -> None:
     )
     assert found == {"uuid": NODE, "octets_written": 21, "verified": True, "seconds": 1.0, "from": 3, "sequence": 9,
                      "changes": ["the name changes"]}  # fmt: skip
-    assert (work.given[2:4], work.named) == ([NODE, 3], {"dry_run": False})
-    work.result = SimpleNamespace(uuid=UUID, sequence=9, changes=(), written=None)
+    assert "a draft is kept" in people.err
+    assert work.given[2] == RestoreOrder(NODE, 3)
+    call(home, "write", NODE, "--from", "3", "--retype", "--sequence-jump", "--yes", *NFC)
+    assert work.given[2] == RestoreOrder(NODE, 3, retyped=True, jump=True)
+    work.named["operator"].jump("--yes answers this")
+    work.result = SimpleNamespace(uuid=UUID, sequence=9, changes=(), written=None, warnings=())
     people, found = both(home, "write", NODE, "--from", "3", "--dry-run", *NFC)
     assert people.out == f"Plan: restore the datasheet of sequence 3 on {NODE}.\n  no changes\n"
     assert found == {"uuid": NODE, "plan": "write", "from": 3, "changes": []}
-    assert work.named == {"dry_run": True}
+    assert work.given[2] == RestoreOrder(NODE, 3, dry_run=True)
 
 
 def test_what_read_prints_and_writes(home: Path, tmp_path: Path, stand_in: Any) -> None:

@@ -1496,6 +1496,20 @@ PATTERNS = (
         "tests/protocol/test_jose.py",
     ),
     Pattern(
+        "an older datasheet leaves a draft where it is",
+        "restore_datasheet",
+        "not warnings",
+        "True",
+        "tests/provisioning/test_datasheet_history.py",
+    ),
+    Pattern(
+        "an older datasheet of another type needs a word",
+        "restore_datasheet",
+        "retype and not known",
+        "False",
+        "tests/provisioning/test_datasheet_history.py",
+    ),
+    Pattern(
         "a replaced board's draft goes",
         "Pins.unpin",
         "self._datasheets.drop_draft(uuid)",

@@ -135,6 +135,19 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
     assert station.datasheets.draft(board.uuid) is None, "nothing was begun"
 
 
+def test_a_datasheet_by_document_keeps_a_draft_that_was_not_written(
+    station: Station, board: Board, calibrated: Path
+) -> None:
+    blocks = dict(station.datasheets.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
+    build(station, board.uuid, BuildOrder(ANGLE, name="trial"))
+    draft = station.datasheets.draft(board.uuid)
+    del blocks[1, AccessCode.CALIBRATION]
+    with talk(board) as node:
+        done = write_sheet(station, node, blocks, SilentReporter())
+    assert any("draft drop" in warning for warning in done.plan.warnings)
+    assert station.datasheets.draft(board.uuid) == draft
+
+
 def angle() -> tuple[Calibration, Channel]:
     profile = load_profile(ANGLE)
     made = read_calibrations(DEGREES, "angle.csv", profile)

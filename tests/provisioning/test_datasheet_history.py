@@ -11,16 +11,28 @@ import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.provisioning import datasheet_history
-from teds_provision.provisioning.build import build
-from teds_provision.provisioning.datasheet_history import drop_draft, history_of, restore_datasheet
+from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.build import BuildOrder, build
+from teds_provision.provisioning.datasheet_history import (
+    RestoredDatasheet,
+    RestoreOrder,
+    drop_draft,
+    history_of,
+    restore_datasheet,
+)
 from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.visit import NodeVisit
 from teds_provision.station.station import Station
+from tests.answers import Answers
 from tests.bench import Board, talk
 
 from .test_provision import ANGLE, run
+
+FINGER = BuildOrder(profile="tactile-finger-sensor")
 
 
 def last(station: Station, act: str) -> tuple[str, dict[str, Any]]:
@@ -42,6 +54,13 @@ def test_a_draft_is_dropped_once_and_is_in_the_log(station: Station, board: Boar
     assert drop_draft(station, node).draft == kept
     assert station.datasheets.draft(board.uuid) is None
     assert last(station, "draft") == ("dropped", {"stage": kept.stage, "profile": kept.profile})
+
+
+def restored(
+    station: Station, order: RestoreOrder, operator: Operator | None = None, links: LinkSettings | None = None
+) -> RestoredDatasheet:
+    """Restore a datasheet with nobody there to be asked, unless ``operator`` answers."""
+    return restore_datasheet(station, links or LinkSettings(), order, SilentReporter(), operator=operator or Operator())
 
 
 @pytest.fixture
@@ -69,13 +88,16 @@ def test_a_datasheet_of_before_is_signed_anew_under_the_next_number(
     node = board.uuid.hex()
     uuid, known = history_of(station, node)
     assert (uuid, [record.sequence for record in known]) == (board.uuid, [2, 1])
-    plan = restore_datasheet(station, LinkSettings(), node, 1, SilentReporter(), dry_run=True)
+    plan = restore_datasheet(
+        station, LinkSettings(), RestoreOrder(node, 1, dry_run=True), SilentReporter(), operator=Operator()
+    )
     assert (plan.uuid, plan.sequence, plan.written, visits) == (board.uuid, 1, None, [])
     assert len(plan.changes) == 1
-    build(station, board.uuid, replace(ANGLE, name="third"))
     with station.transaction():
         station.nodes.remember(board.uuid, profile="another-type")
-    done = restore_datasheet(station, LinkSettings(nfc="usb", ble="hci0"), node, 1, SilentReporter())
+    done = restore_datasheet(
+        station, LinkSettings(nfc="usb", ble="hci0"), RestoreOrder(node, 1), SilentReporter(), operator=Operator()
+    )
     assert visits == [{"uuid": board.uuid, "via": "ble", "unlock": "always", "writes": "write"}]
     assert (done.uuid, done.sequence, done.changes) == (board.uuid, 3, plan.changes)
     assert done.written is not None
@@ -83,7 +105,8 @@ def test_a_datasheet_of_before_is_signed_anew_under_the_next_number(
     now = station.datasheets.datasheet(board.uuid)
     assert now is not None
     assert now.unsigned_blocks() == known[1].image.unsigned_blocks()
-    assert station.datasheets.draft(board.uuid) is None, "what was signed last took the place of the draft"
+    assert done.warnings == plan.warnings == ()
+    assert station.datasheets.draft(board.uuid) is None, "what was signed is written"
     assert last(station, "write")[1]["sequence"] == 3
     record = station.nodes.get(board.uuid)
     assert record is not None
@@ -94,8 +117,62 @@ def test_a_datasheet_of_before_is_signed_anew_under_the_next_number(
 def test_what_the_node_has_already_costs_no_number(
     station: Station, board: Board, visits: list[dict[str, Any]]
 ) -> None:
-    done = restore_datasheet(station, LinkSettings(), board.uuid.hex(), 2, SilentReporter())
+    done = restore_datasheet(
+        station, LinkSettings(), RestoreOrder(board.uuid.hex(), 2), SilentReporter(), operator=Operator()
+    )
     assert (done.sequence, done.changes, board.state.sequence) == (2, (), 2)
+
+
+def test_a_draft_that_was_not_written_is_kept_and_named(
+    station: Station, board: Board, visits: list[dict[str, Any]]
+) -> None:
+    node = board.uuid.hex()
+    build(station, board.uuid, replace(ANGLE, name="third"))
+    draft = station.datasheets.draft(board.uuid)
+    plan = restore_datasheet(
+        station, LinkSettings(), RestoreOrder(node, 1, dry_run=True), SilentReporter(), operator=Operator()
+    )
+    done = restored(station, RestoreOrder(node, 1))
+    assert (done.sequence, board.state.sequence) == (3, 3)
+    assert station.datasheets.draft(board.uuid) == draft
+    (warning,) = plan.warnings
+    assert done.warnings == (warning,)
+    assert "draft (built as magnetic-angular-position-sensor)" in warning
+    assert warning.endswith(f"teds-provision draft drop {node}")
+
+
+def test_another_type_and_a_jump_of_the_sequence_need_a_word(
+    station: Station, board: Board, visits: list[dict[str, Any]]
+) -> None:
+    node = board.uuid.hex()
+    run(station, board, order=replace(FINGER, retype=True))
+    with pytest.raises(WrongBoardError) as other:
+        restored(station, RestoreOrder(node, 1))
+    assert other.value.differences
+    assert board.state.sequence == 3
+    asked: list[bytes] = []
+    answers = Answers(retype=lambda uuid, differences: asked.append(uuid))
+    assert restored(station, RestoreOrder(node, 1), answers).sequence == 4
+    assert asked == [board.uuid]
+    done = restore_datasheet(
+        station, LinkSettings(), RestoreOrder(node, 3, retyped=True), SilentReporter(), operator=Operator()
+    )
+    assert done.sequence == 5
+    with station.transaction():
+        station.nodes.remember(board.uuid, sequence=5 + SEQUENCE_WINDOW)
+    with pytest.raises(PolicyError, match="far ahead"):
+        restore_datasheet(
+            station, LinkSettings(), RestoreOrder(node, 2, retyped=True), SilentReporter(), operator=Operator()
+        )
+    with pytest.raises(PolicyError, match="no person"):
+        restore_datasheet(
+            station, LinkSettings(), RestoreOrder(node, 2, jump=True), SilentReporter(), operator=Operator()
+        )
+    jumps = Answers(jump=lambda question: None)
+    restore_datasheet(
+        station, LinkSettings(), RestoreOrder(node, 2, jump=True, retyped=True), SilentReporter(), operator=jumps
+    )
+    assert board.state.sequence > 5 + SEQUENCE_WINDOW
 
 
 def test_what_is_refused_before_any_node_is_waited_for(
@@ -103,11 +180,13 @@ def test_what_is_refused_before_any_node_is_waited_for(
 ) -> None:
     node = board.uuid.hex()
     with pytest.raises(NotFoundError) as unknown:
-        restore_datasheet(station, LinkSettings(), node, 7, SilentReporter())
+        restored(station, RestoreOrder(node, 7))
     assert unknown.value.message == f"Node {node} never had a datasheet with sequence 7."
     assert unknown.value.hint == "Known are: 2, 1."
     with station.transaction():
         station.pins.remove(board.uuid)
     with pytest.raises(PolicyError):
-        restore_datasheet(station, LinkSettings(), node, 1, SilentReporter(), dry_run=True)
+        restore_datasheet(
+            station, LinkSettings(), RestoreOrder(node, 1, dry_run=True), SilentReporter(), operator=Operator()
+        )
     assert visits == []

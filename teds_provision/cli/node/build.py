@@ -34,6 +34,7 @@ from teds_provision.teds.certificate import CertificateReference
 
 if TYPE_CHECKING:
     from teds_provision.cli import terminal_operator
+    from teds_provision.provisioning.datasheet_history import RestoreOrder
     from teds_provision.provisioning.write import WriteResult
 else:  # imports the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
@@ -275,7 +276,8 @@ def write(
     if sequence is not None:
         if image is not None:
             raise UsageError("--from and --image cannot be combined.", hint="Use one of them.")
-        _bring_back(app, uuid, sequence, links, dry_run=dry_run)
+        order = provisioning.datasheet_history.RestoreOrder(uuid, sequence, retype, sequence_jump, dry_run)
+        _bring_back(app, order, links, yes=yes)
         return
     if dry_run:
         done = provisioning.write.plan_write(app.station(), uuid, image)
@@ -299,18 +301,20 @@ def write(
     app.emit(_to_json(node, written), f"Node {node}: {_said(written)}.")
 
 
-def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
+def _bring_back(app: App, order: RestoreOrder, links: LinkSettings, *, yes: bool) -> None:
     done = provisioning.datasheet_history.restore_datasheet(
-        app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run
+        app.station(), links, order, reporter_for(app), operator=terminal_operator.TerminalOperator(app, yes=yes)
     )
+    for warning in done.warnings:
+        app.warn(warning)
     node, changes = done.uuid.hex(), [change.text for change in done.changes]
     lines = "".join(f"\n  {text}" for text in changes) or "\n  no changes"
     if done.written is None:
-        plan = {"uuid": node, "plan": "write", "from": sequence, "changes": changes}
-        app.emit(plan, f"Plan: restore the datasheet of sequence {sequence} on {node}.{lines}")
+        plan = {"uuid": node, "plan": "write", "from": order.sequence, "changes": changes}
+        app.emit(plan, f"Plan: restore the datasheet of sequence {order.sequence} on {node}.{lines}")
         return
-    result = _to_json(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
-    sentence = f"datasheet {sequence} restored as sequence {done.sequence}"
+    result = _to_json(node, done.written) | {"from": order.sequence, "sequence": done.sequence, "changes": changes}
+    sentence = f"datasheet {order.sequence} restored as sequence {done.sequence}"
     app.emit(result, f"Node {node}: {sentence}; {_said(done.written)}.{lines}")
 
 
