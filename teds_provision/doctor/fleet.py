@@ -88,7 +88,8 @@ def profiles(system: System) -> Iterator[Finding]:
 @check("store file", "store")
 def store_file(system: System) -> Iterator[Finding]:
     """Check that the store is there if the vault is: one without the other is a loss."""
-    if (system.home / "vault.json").exists() and not has_store(system.home):
+    vault = any((system.home / name).exists() for name in ("vault.json", "vault-pkcs11.json"))
+    if vault and not has_store(system.home):
         why = f"{system.home} has a vault but no store: names, pins and wrapped keys of all nodes are missing."
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
 

@@ -122,9 +122,20 @@ def _backups(log: AuditLog, nodes: int) -> Iterator[Finding]:
         )
         return
     days = (datetime.now(UTC) - datetime.strptime(taken[-1], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)).days
+    if days < -1:  # the clock was ahead then, or is behind now: such a backup would never get old
+        yield Finding(
+            "backup",
+            "warning",
+            f"The last backup is dated {taken[-1]}, in the future.",
+            f"Check the clock, then: {fix}",
+        )
+        return
     old = days > _BACKUP_DAYS
     yield Finding(
-        "backup", "warning" if old else "ok", f"The last backup is {counted(days, 'day')} old.", fix if old else ""
+        "backup",
+        "warning" if old else "ok",
+        f"The last backup is {counted(max(days, 0), 'day')} old.",
+        fix if old else "",
     )
 
 

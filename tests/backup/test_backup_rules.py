@@ -94,10 +94,21 @@ def test_a_backup_beside_a_change_of_the_master_key_is_written_again(
         assert Material.decode(content.material).masters.keys.keys() == {2}
 
 
-def test_the_age_of_a_backup() -> None:
-    made = BackupHead("id", POINT, "n", "2026-01-01T00:00:00Z", "file", "")
-    assert made.age_days(datetime(2026, 1, 13, 12, tzinfo=UTC)) == 12
-    assert replace(made, created="yesterday").age_days() == 0
+@pytest.mark.parametrize(
+    ("created", "days"),
+    [
+        ("2026-01-01T00:00:00Z", 12),
+        ("2026-01-13T12:00:00", 0),
+        ("2026-01-12T12:00:00", 1),
+        ("2026-01-12T12:00:01Z", 0),
+        ("2026-01-12T15:00:00+02:00", 0),
+        ("2026-01-13T12:00:01Z", -1),
+        ("yesterday", 0),
+    ],
+)
+def test_the_age_of_a_backup(created: str, days: int) -> None:
+    made = BackupHead("id", POINT, "n", created, "file", "")
+    assert made.age_days(datetime(2026, 1, 13, 12, tzinfo=UTC)) == days
 
 
 def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(

@@ -400,6 +400,7 @@ def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:
         ((90,), "ok", "The last backup is 90 days old."),
         ((91,), "warning", "The last backup is 91 days old."),
         ((400, 5), "ok", "The last backup is 5 days old."),
+        ((-1,), "ok", "The last backup is 0 days old."),
     ],
 )
 def test_a_backup_is_old_after_90_days_and_the_last_one_counts(
@@ -413,6 +414,18 @@ def test_a_backup_is_old_after_90_days_and_the_last_one_counts(
     (backup,) = (finding for finding in look(stationed, "store") if finding.name == "backup")
     fix = "" if result == "ok" else "teds-provision backup FILE"
     assert (backup.result, backup.why, backup.fix) == (result, why, fix)
+
+
+def test_a_backup_of_a_clock_that_was_ahead_is_a_warning(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch, Station.inspect(stationed.home) as store:
+        patch.setattr("teds_provision.station.store.audit.utc_now", lambda: "2099-01-01T00:00:00Z")
+        store.audit("backup", None, "done")
+    (backup,) = (finding for finding in look(stationed, "store") if finding.name == "backup")
+    assert (backup.result, backup.why, backup.fix) == (
+        "warning",
+        "The last backup is dated 2099-01-01T00:00:00Z, in the future.",
+        "Check the clock, then: teds-provision backup FILE",
+    )
 
 
 @pytest.mark.parametrize(("free", "result"), [(64 << 20, "ok"), ((64 << 20) - 1, "warning")])
@@ -558,8 +571,14 @@ def test_profiles_of_this_home_alone_are_checked(system: System, monkeypatch: py
     assert not any("theirs" in finding.why for finding in broken)
 
 
-def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: System) -> None:
+@pytest.mark.parametrize("vault", ["vault.json", "vault-pkcs11.json", None])
+def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: System, vault: str | None) -> None:
     (stationed.home / "store.sqlite3").unlink()
+    if vault is None:
+        (stationed.home / "vault.json").unlink()
+        assert "store file" not in by_name(stationed)
+        return
+    (stationed.home / "vault.json").rename(stationed.home / vault)
     found = by_name(stationed)["store file"]
     assert (found.result, "restore" in found.fix) == ("failed", True)
 
