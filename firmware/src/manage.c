@@ -5,6 +5,7 @@
 #include "manage.h"
 #include "about.h"
 #include "clock.h"
+#include "security_teds.h"
 #include "inside.h"
 
 #if TEDS_MANAGED
@@ -23,6 +24,7 @@
 /* -- a CBOR reader (RFC 8949) for this filter ---------------------------------------------------------------------- */
 
 enum { UNSIGNED = 0, OCTETS = 2, TEXT = 3, ARRAY = 4, MAP = 5, TAG = 6, SIMPLE = 7 };
+enum { FALSE_VALUE = 20, NULL_VALUE = 22 }; /* simple values; between them lies true, and no other one is accepted */
 #define OPEN_END 31u /* of an array or map of indefinite length; as a simple value, its end */
 
 typedef struct reading {
@@ -37,7 +39,7 @@ typedef struct item {
 } item;
 
 /* Read an item's head, and a string's octets; false if it is cut off or of a kind that is never accepted (tags,
- * floating numbers, strings in pieces). */
+ * floating numbers, strings in pieces, text that is not UTF-8). */
 static bool read_item(reading *in, item *out)
 {
     uint8_t additional;
@@ -52,7 +54,8 @@ static bool read_item(reading *in, item *out)
     if (out->open) {
         return out->major == ARRAY || out->major == MAP || out->major == SIMPLE;
     }
-    if (out->major == TAG || additional > 27 || (out->major == SIMPLE && additional > 23)) {
+    if (out->major == TAG || additional > 27 ||
+        (out->major == SIMPLE && (additional < FALSE_VALUE || additional > NULL_VALUE))) {
         return false;
     }
     if (additional >= 24) {
@@ -75,7 +78,7 @@ static bool read_item(reading *in, item *out)
         }
         in->at += out->value;
     }
-    return true;
+    return out->major != TEXT || teds_is_utf8(out->octets, out->value);
 }
 
 /* Members of an upload's packet, or of the answer to one. */
@@ -137,8 +140,8 @@ typedef struct level {
     uint32_t left;
 } level;
 
-/* True if the octets are one map and nothing else. `plain`: of definite length, with text keys and without nested maps
- * or arrays. `out` receives the members of the outer map; NULL: they are skipped. */
+/* True if the octets are one map and nothing else, with keys of text alone, at every depth. `plain`: of definite length
+ * and without nested maps or arrays. `out` receives the members of the outer map; NULL: they are skipped. */
 static bool read_map(const uint8_t *octets, size_t length, bool plain, packet_map *out)
 {
     reading in = {octets, octets + length};
@@ -159,14 +162,14 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, packet_ma
             depth--;
         } else {
             const bool container = it.major == ARRAY || it.major == MAP;
+            if (in_it != NULL && in_it->map && !in_it->odd && it.major != TEXT) {
+                return false;
+            }
             if (depth == 1) {
-                if (plain && (container || (!in_it->odd && it.major != TEXT))) {
+                if ((plain && container) || (out != NULL && in_it->odd && !note_value(out, key, &it))) {
                     return false;
                 }
-                if (out != NULL && in_it->odd && !note_value(out, key, &it)) {
-                    return false;
-                }
-                key = !in_it->odd && it.major == TEXT ? find_key(&it) : IGNORED_MEMBER;
+                key = in_it->odd ? IGNORED_MEMBER : find_key(&it);
             }
             if (in_it != NULL) {
                 in_it->odd = in_it->map && !in_it->odd;
@@ -352,7 +355,10 @@ static void continue_upload(teds_node *node, teds_session *session, const packet
     if (answer->refuses) {
         return;
     }
-    own->upload_of = answer->complete || (answer->off_there && answer->off >= own->upload_octets) ? NULL : session;
+    /* An image whose length nobody gave is never whole; of one that has more octets than its length nothing can follow. */
+    own->upload_of = answer->complete || (answer->off_there && own->upload_octets != 0 && answer->off >= own->upload_octets)
+                         ? NULL
+                         : session;
     own->upload_until = teds_now(node) + UPLOAD_NS;
 }
 

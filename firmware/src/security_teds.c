@@ -90,8 +90,7 @@ void teds_put_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS])
     teds_put16(at + sizeof TAIL, teds_checksum(out, TEDS_INITIAL_OCTETS - 2));
 }
 
-/* RFC 3629: no overlong forms, no surrogates, nothing above U+10FFFF. */
-static bool is_utf8(const uint8_t *text, size_t length)
+bool teds_is_utf8(const uint8_t *text, size_t length)
 {
     size_t at = 0;
     while (at < length) {
@@ -148,7 +147,7 @@ static bool take_field(const teds_node *node, teds_signed *out, const uint8_t wa
 {
     const uint8_t type = wanted[0];
     if (type == 5) {
-        return length <= wanted[1] && is_utf8(value, length);
+        return length <= wanted[1] && teds_is_utf8(value, length);
     }
     if (length != wanted[1]) {
         return false;

@@ -35,4 +35,7 @@ uint16_t teds_checksum(const uint8_t *octets, size_t length);
 /* True if an image is valid by itself: length, checksum, and the access code in its header. */
 bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length);
 
+/* RFC 3629: no overlong forms, no surrogates, nothing above U+10FFFF. */
+bool teds_is_utf8(const uint8_t *text, size_t length);
+
 #endif

@@ -218,7 +218,7 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_ANY_VALUES": Change("security_teds.c", "case 1: return value[0] == wanted[2];", "case 1: return true;"),
     "FAULT_UTF8_NOT_CHECKED": Change(
-        "security_teds.c", "length <= wanted[1] && is_utf8(value, length)", "length <= wanted[1]"
+        "security_teds.c", "length <= wanted[1] && teds_is_utf8(value, length)", "length <= wanted[1]"
     ),
     "FAULT_REFUSES_111": Change("security_teds.c", "} else if (type <= 110) { /*", "} else { /*"),
     "FAULT_RESET_FORGETS_EPOCH": Change("commit.c", "    state.epoch = node->state.epoch;\n", ""),

@@ -41,7 +41,7 @@ def _library(path: Path) -> Any:
     library.memory_new.restype = ctypes.c_void_p
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
     library.memory_steps.restype = library.memory_chip_calls.restype = library.memory_reads.restype = ctypes.c_long
-    library.memory_poll.restype = ctypes.c_uint64
+    library.memory_poll.restype = library.memory_missed.restype = ctypes.c_uint64
     library.memory_image_flash.restype = ctypes.c_size_t
     library.memory_restarts.restype = library.memory_images.restype = ctypes.c_bool
     library.memory_written.restype, library.memory_spare_slot_fails.restype = ctypes.c_long, ctypes.c_bool
@@ -242,6 +242,15 @@ class MemoryNode:
     def spare_slot_fails(self) -> bool:
         """Whether its spare slot could not be erased."""
         return bool(self._library.memory_spare_slot_fails(self._board))
+
+    def has_slots_of(self, octets: int) -> None:
+        """Have slots of so many octets; before the start."""
+        self._library.memory_slot_octets(self._board, ctypes.c_uint32(octets))
+
+    @property
+    def missed(self) -> int:
+        """Data messages that it could not send, since its start."""
+        return int(self._library.memory_missed(self._board))
 
     @property
     def reads(self) -> int:

@@ -6,7 +6,7 @@ import itertools
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
@@ -20,6 +20,7 @@ from tests.firmware.desk import CDesk
 from tests.firmware.smp import packet
 from tests.protocol.desk import CREDENTIALS, NAME, UUID
 from tests.protocol.operation.bench import DIGEST
+from tests.protocol.test_manage import ManagedDesk
 
 pytestmark = pytest.mark.system
 
@@ -418,8 +419,75 @@ def test_maps_and_lists_without_a_length_pass_and_may_be_seven_deep() -> None:
     assert desk.manage(packet(smp.ECHO, b"\xa1\x61d" + b"\x81" * 7 + b"\x00")).ok
 
 
-def test_an_answer_that_is_none_gets_11() -> None:
-    desk = Board.make().keyed()
+@pytest.mark.parametrize(
+    ("command", "body", "why"),
+    [
+        (smp.STATES, b"\xa1\x01\x01", 4),  # a key that is no text
+        (smp.ECHO, b"\xa1\x41d\x01", 4),
+        (smp.ECHO, b"\xa1\xf5\x01", 4),
+        (smp.ECHO, b"\xa1\x61d\xa1\x01\x01", 4),  # one map further in
+        (smp.ECHO, b"\xa1\x61d\x81\xa1\x01\x01", 4),
+        (smp.ECHO, b"\xa1\x61d\xa1\x61e\x01", None),
+        (smp.ECHO, b"\xa1\x61d\xf6", None),  # null
+        (smp.ECHO, b"\xa1\x61d\xf4", None),
+        (smp.ECHO, b"\xa1\x61d\xf7", 4),  # undefined
+        (smp.ECHO, b"\xa1\x61d\xf3", 4),
+        (smp.ECHO, b"\xa1\x61d\x61\xff", 4),  # not UTF-8
+        (smp.ECHO, b"\xa1\x61\xff\x01", 4),
+        (smp.ECHO, b"\xa1\x61d\x62\xc3\xa4", None),
+        (smp.ECHO, b"\xbf\x61d\x01\xff", None),
+        (smp.UPLOAD, b"\xbf\x63off\x01\xff", 4),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x61x\xa0", 4),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x61x\x80", 4),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x61x\xf6", None),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x63len\xf5", 4),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x63len\x20", 4),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x63len\x1b\0\0\0\2\0\0\0\0", None),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x63sha\xf6", 4),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x63sha\x58\x20" + OTHER, None),
+        (smp.UPLOAD, b"\xa2\x63off\x01\x63sha\x58\x21" + OTHER + b"x", 4),
+    ],
+)
+def test_both_nodes_pass_and_refuse_the_same_bodies(
+    command: tuple[int, int, int], body: bytes, why: int | None
+) -> None:
+    assert Board.make().keyed().why(packet(command, body)) == why
+    assert ManagedDesk().refuses(packet(command, body)) == why
+
+
+@pytest.mark.parametrize(
+    ("first", "answers", "lives"),
+    [
+        ({"len": 1000}, [{"off": 40}, {"off": 999}], True),
+        ({"len": 1000}, [{"off": 40}, {}], True),
+        ({"len": 1000}, [{"off": 40}, {"off": 1000}], False),
+        ({"len": 1000}, [{"off": 40}, {"off": 1001}], False),  # more than it has: nothing can follow
+        ({"len": 1000}, [{"off": 40}, {"off": 1 << 32}], False),
+        ({"len": 1000}, [{"off": 40}, {"match": False}], False),
+        ({"len": 1000}, [{"off": 1000}], False),
+        ({}, [{"off": 40}], True),  # nobody knows when it is whole
+        ({}, [{"off": 40}, {"off": 80, "match": True}], False),
+    ],
+)
+def test_both_nodes_end_an_upload_alike(first: dict[str, int], answers: list[dict[str, Any]], lives: bool) -> None:
+    desk, python = Board.make().keyed(), ManagedDesk()
+
+    def answered(answer: dict[str, Any], **body: object) -> None:
+        desk.firmware.answer = python.manager.answer = answer
+        octets = packet(smp.UPLOAD, smp.encode(body))
+        assert desk.why(octets) is None
+        assert python.refuses(octets) is None
+
+    answered({"off": 4}, off=0, len=4, data=b"1234")  # the upload before it, whole
+    for off, answer in enumerate(answers):
+        answered(answer, off=off, data=b"", **({} if off else first))
+    write, why = write_teds(1, 12, 0, NAME), 17 if lives else None
+    assert desk.sealed(write).reason == why
+    assert python.sealed(write, link="can:f1").reason == why
+
+
+def test_an_answer_that_is_none_gets_11_of_either_node() -> None:
+    desk, python = Board.make().keyed(), ManagedDesk(buffer=971)
     good = packet((smp.READ | 1, 0, 6), smp.encode({"buf_size": 971}))
     for wrong in (
         b"",
@@ -435,13 +503,19 @@ def test_an_answer_that_is_none_gets_11() -> None:
         packet((smp.READ | 1, 0, 6), b"\xa1\x61a\xfa\0\0\0\0"),
         packet((smp.READ | 1, 0, 6), smp.encode({"x": bytes(2000)}))[:1900],
     ):
-        desk.firmware.raw = wrong
-        assert desk.manage(packet(smp.PARAMETERS)).reason == Reason.FLASH_FAILURE
-    desk.firmware.raw = good
-    assert desk.manage(packet(smp.PARAMETERS)).payload == good
-    desk.firmware.raw = longest = packet((smp.READ | 1, 0, 6), smp.encode({"x": bytes(971 - 8 - 6)}))
+        desk.firmware.raw = python.manager.raw = wrong
+        assert desk.manage(packet(smp.PARAMETERS)).reason == 11
+        assert python.ask(packet(smp.PARAMETERS)).reason == 11
+    longest = packet((smp.READ | 1, 0, 6), smp.encode({"x": bytes(971 - 8 - 6)}))
     assert len(longest) == 971
-    assert desk.manage(packet(smp.PARAMETERS)).payload == longest
+    for right in (good, longest):
+        desk.firmware.raw = python.manager.raw = right
+        assert desk.manage(packet(smp.PARAMETERS)).payload == right
+        assert python.ask(packet(smp.PARAMETERS)).payload == right
+    for off in (b"\x61x", b"\x20", b"\xf5"):
+        desk.firmware.raw = python.manager.raw = packet((smp.WRITE | 1, 1, 1), b"\xa1\x63off" + off)
+        assert desk.manage(piece(0)).reason == 11
+        assert python.ask(piece(0)).reason == 11
 
 
 def test_a_restart_waits_until_its_reply_has_left() -> None:

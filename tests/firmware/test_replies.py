@@ -6,8 +6,10 @@ import pytest
 
 from teds_provision.links.can.isotp import physical_id, single
 from teds_provision.protocol.messages.frames import Function, security_command
+from tests.firmware.desk import CDesk
 from tests.firmware.memory_node import MemoryNode
 from tests.firmware.test_manage import Firmware
+from tests.firmware.test_power_cuts import commit, confirm
 from tests.protocol.desk import NODE, UUID
 
 pytestmark = pytest.mark.system
@@ -32,8 +34,11 @@ class Stations:
 
     def locate(self, number: int, transaction: int = 5, seconds: int = 60) -> bytes:
         """Ask for it; return what the node sends back."""
-        frame = bytes((transaction,)) + security_command(Function.LOCATE, bytes((seconds,))).encode()
-        self.node.take_frame(physical_id(self.address, number), single(frame), fd=True)
+        return self.ask(number, bytes((transaction,)) + security_command(Function.LOCATE, bytes((seconds,))).encode())
+
+    def ask(self, number: int, body: bytes) -> bytes:
+        """Send one request; return what the node sends back."""
+        self.node.take_frame(physical_id(self.address, number), single(body, fd=True), fd=True)
         return self._take_all()
 
     def _take_all(self) -> bytes:
@@ -58,10 +63,36 @@ def test_a_reply_is_kept_for_20_seconds(stations: Stations) -> None:
     assert stations.firmware.blinks == [60]
     assert stations.locate(0xF1, transaction=6) != reply
     assert stations.firmware.blinks == [60, 60], "another transaction is another wish"
-    stations.now = 39.999 + 0.001
+    stations.now = 39.999  # 20 s after it
     stations.locate(0xF1, transaction=6)
     assert stations.firmware.blinks == [60, 60, 60]
     stations.node.close()
+
+
+def test_about_is_answered_anew_each_time(stations: Stations) -> None:
+    about = b"\x05" + bytes.fromhex("000080150000")
+    for text in (b"board/one", b"board/two"):
+        stations.firmware.text = text
+        assert text in stations.ask(0xF1, about)
+    stations.node.close()
+
+
+def test_list_is_answered_anew_each_time() -> None:
+    desk = CDesk()
+    confirm(desk)
+
+    def name_all() -> str:
+        asked = bytes.fromhex("07 0500 0080 0b0000")
+        desk.node.take_frame(physical_id(desk.node.can_address, 0xF5), asked, fd=True)
+        desk.node.poll()
+        sent = desk.node.next_frame()
+        assert sent is not None
+        return sent[1].hex()
+
+    assert name_all() == name_all() == "0705010003000080"
+    assert commit(desk).ok
+    assert name_all().startswith("000d0501000900000100008000010c")
+    CDesk.close_all()
 
 
 def test_the_oldest_reply_gives_way(stations: Stations) -> None:

@@ -2796,8 +2796,8 @@ PATTERNS = (
     Pattern(
         "the length of an upload is that of its first piece",
         "ManageFilter._upload_piece",
-        'piece.get("len") if piece["off"] == 0 else None',
-        'piece.get("len")',
+        'piece["off"] == 0',
+        '"len" in piece',
         "tests/protocol/test_manage.py",
     ),
     Pattern(

@@ -1,6 +1,6 @@
 """SMP packets as Manage (128.23) carries them: header, and a body that is one CBOR map (profile.md, "Manage").
 
-cbor2 decodes; what it would take beyond plain values (tags, floating numbers, null) is refused here.
+cbor2 decodes; what it would take beyond plain values (tags, floating numbers, undefined) is refused here.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def decode_packet(octets: bytes) -> SmpPacket:
 
 
 def decode_map(body: bytes) -> dict[str, Any]:
-    """Read a body: one map of text to text, whole numbers, booleans, octets, lists and maps, and nothing after it.
+    """Read a body: one map of text to text, whole numbers, booleans, null, octets, lists and maps, and no more.
 
     Raises ValueError for anything else, NotFoundError if cbor2 is not installed.
     """
@@ -123,7 +123,7 @@ def _require_plain(value: object) -> None:
     elif isinstance(value, list):
         for entry in value:
             _require_plain(entry)
-    elif not isinstance(value, str | int | bytes):
+    elif not isinstance(value, str | int | bytes | None):
         raise ValueError(f"the map has a value of the type {type(value).__name__}")
 
 

@@ -35,6 +35,10 @@ UPLOAD_SECONDS: Final = 60.0
 _ANOTHER_SECONDS: Final = 10.0
 """Seconds after the start of an upload in which another image is refused: each start erases flash."""
 
+_SHA_OCTETS: Final = 32
+_OPEN_MAP: Final = 0xBF
+"""First octet of a map of indefinite length."""
+
 _CONFIRM: Final = re.compile(rb"\xa1\x67confirm\xf5", re.DOTALL)
 _START: Final = re.compile(rb"\xa1\x64hash\x58\x20.{32}|\xa2\x64hash\x58\x20.{32}\x67confirm\xf4", re.DOTALL)
 
@@ -131,12 +135,30 @@ class ManageFilter:
         if packet.command == RESTART:
             self.restart_link = link
             return packet.reply(EMPTY_MAP).encode()
+        reply = self._manager.manage(octets)
+        answer = self._answer(packet, reply)
         if packet.command == UPLOAD:
-            return self._upload_piece(packet, session)
-        return self._manager.manage(octets)
+            if not _is_count(answer.get("off", 0)):
+                raise CommandRefusedError(Reason.FLASH_FAILURE)
+            self._upload_piece(packet, session, answer)
+        return reply
+
+    @property
+    def _most_octets(self) -> int:
+        return min(self._max_message - MANAGE_OVERHEAD, self._manager.buffer)
+
+    def _answer(self, packet: SmpPacket, reply: bytes) -> dict[str, object]:
+        """Return the map of the manager's reply; raises CommandRefusedError (11) if it is no reply to this packet."""
+        try:
+            decoded = decode_packet(reply)
+            if len(reply) <= self._most_octets and packet.reply(decoded.body).encode() == reply:
+                return decode_map(decoded.body)
+        except ValueError:
+            pass
+        raise CommandRefusedError(Reason.FLASH_FAILURE)
 
     def _whole(self, octets: bytes) -> SmpPacket:
-        if len(octets) > min(self._max_message - MANAGE_OVERHEAD, self._manager.buffer):
+        if len(octets) > self._most_octets:
             raise CommandRefusedError(Reason.TOO_LARGE)
         if len(octets) < LEAST_OCTETS:
             raise CommandRefusedError(Reason.BAD_FORM)
@@ -183,21 +205,18 @@ class ManageFilter:
             raise CommandRefusedError(Reason.BUSY)
         self._started = (sha, now)
 
-    def _upload_piece(self, packet: SmpPacket, session: NodeSession) -> bytes:
+    def _upload_piece(self, packet: SmpPacket, session: NodeSession, answer: dict[str, object]) -> None:
         piece = decode_map(packet.body)
-        octets = piece.get("len") if piece["off"] == 0 else None
-        if isinstance(octets, int):
-            self._started_octets = octets
-        reply = self._manager.manage(packet.encode())
-        try:
-            answer = decode_map(decode_packet(reply).body)
-        except ValueError:
-            return reply  # not a map: the station handles it
+        if piece["off"] == 0:
+            self._started_octets = piece.get("len", 0)
         if any(key in answer for key in SMP_ERROR_KEYS):
-            return reply
-        done = answer.get("off") == self._started_octets
+            return
+        done = "match" in answer or self._is_whole(answer.get("off"))
         self._upload = None if done else _Upload(session, self._clock())
-        return reply
+
+    def _is_whole(self, off: object) -> bool:
+        """Return True if all octets came, or more: nothing can follow. Without a length an image is never whole."""
+        return isinstance(off, int) and 0 < self._started_octets <= off
 
 
 def _confirms(packet: SmpPacket) -> bool:
@@ -213,7 +232,18 @@ def _is_map(body: bytes) -> bool:
 
 
 def _is_piece(body: bytes) -> bool:
-    """Return True if it names an offset, and its digest is octets."""
+    """Return True if what the filter decodes is of its type, in a map of definite length that holds no other one."""
     piece = decode_map(body)
-    off = piece.get("off")
-    return isinstance(off, int) and not isinstance(off, bool) and off >= 0 and isinstance(piece.get("sha", b""), bytes)
+    sha = piece.get("sha", b"")
+    return (
+        body[0] != _OPEN_MAP
+        and _is_count(piece.get("off"))
+        and _is_count(piece.get("len", 0))
+        and isinstance(sha, bytes)
+        and len(sha) <= _SHA_OCTETS
+        and not any(isinstance(value, dict | list) for value in piece.values())
+    )
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0

@@ -587,6 +587,16 @@ bool memory_spare_slot_fails(const memory_board *board)
     return board->node.spare_slot_fails;
 }
 
+void memory_slot_octets(memory_board *board, uint32_t octets)
+{
+    board->port.slot_octets = octets;
+}
+
+uint64_t memory_missed(const memory_board *board)
+{
+    return teds_node_missed(&board->node);
+}
+
 void memory_no_channels(memory_board *board)
 {
     board->port.channel_count = 0;

@@ -65,6 +65,10 @@ void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t m
 void memory_garble(memory_board *board, long unit);
 long memory_written(const memory_board *board);
 bool memory_spare_slot_fails(const memory_board *board);
+/* Its slots have so many octets; before the start. */
+void memory_slot_octets(memory_board *board, uint32_t octets);
+/* Data messages that it could not send. */
+uint64_t memory_missed(const memory_board *board);
 void memory_no_channels(memory_board *board);
 void memory_halt(memory_board *board, uint8_t number, uint8_t halt);
 void memory_hook_up(memory_board *board, memory_hook hook);
