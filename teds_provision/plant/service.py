@@ -277,7 +277,10 @@ class PlantWatch:
             self._changed()
 
     def _say_daily(self) -> None:
-        """Write an empty page each day: a station without a page for seven days counts as silent."""
+        """Write an empty page each day: a station without a page for seven days counts as silent.
+
+        Also after a page that a clock which was ahead has dated a day ahead or more: its date would last for long.
+        """
         station, roster = self._station, self._station.plant.roster
         chain = station.plant.pages.chains().get(station.fingerprint)
         if roster is None or chain is None or not chain.counted[0]:
@@ -285,7 +288,7 @@ class PlantWatch:
         page = station.plant.pages.get(chain.id, *chain.counted)
         if (
             page is not None
-            and (datetime.now(UTC) - datetime.fromisoformat(page.created)).total_seconds() > _EMPTY_PAGE
+            and abs((datetime.now(UTC) - datetime.fromisoformat(page.created)).total_seconds()) > _EMPTY_PAGE
         ):
             plant.sync.write_page(station, roster, empty=True)
 

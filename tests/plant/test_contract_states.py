@@ -283,6 +283,11 @@ def test_the_doctor_looks_at_clocks_psycopg_the_last_sync_and_what_is_undecided(
     roster_line = ("ok", f"plant: roster 2 holds until {now.expires:%Y-%m-%d}.")
     nothing = ("ok", "0 events unsent, 0 conflicts.")
     assert checked(synced=week) == [roster_line, nothing]
+    ahead, far = (
+        f"{today + timedelta(days=days, seconds=seconds):%Y-%m-%dT%H:%M:%SZ}" for days, seconds in ((7, -5), (7, 60))
+    )
+    assert checked(synced=ahead) == [roster_line, nothing]
+    assert checked(synced=far) == [roster_line, ("warning", f"The last sync was {far}."), nothing], "by a wrong clock"
     assert checked(synced=more) == [roster_line, ("warning", f"The last sync was {more}."), nothing]
     assert checked() == [roster_line, ("warning", "The last sync was never."), nothing]
     assert checked(synced=week, url="file:/media/stick") == [roster_line, nothing]
