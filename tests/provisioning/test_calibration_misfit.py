@@ -186,3 +186,33 @@ def test_a_method_that_the_type_asks_for_is_compared() -> None:
     assert calibration.method != "linear" or misfit(calibration, had, had, asks) == ""
     other = replace(own, calibration=replace(own.calibration, method="steps"))
     assert "expects the method steps" in misfit(calibration, had, had, other)
+
+
+def actuator() -> tuple[Calibration, Channel]:
+    profile = load_profile("gripper")
+    made = read_calibrations("# channel: 1\n# date: 2026-10-01\n0,0\n4095,110\n", "gripper.csv", profile)
+    sheet = Sheet.from_blocks(profile.build(bytes(10), calibration=made).blocks)
+    return sheet.calibrations[1], sheet.channels[0]
+
+
+def test_points_are_held_against_limits_that_changed_and_within_the_uncertainty() -> None:
+    """The highest point is 359.9 degrees."""
+    calibration, had = angle()
+    degrees = math.radians
+    for change, words in (
+        ({"low": -1.0, "high": degrees(90)}, "its point of 359.9 ° is beyond the high limit of 90 °"),
+        ({"low": degrees(2), "high": degrees(400)}, "its point of 0 ° is beyond the low limit of 2 °"),
+        ({"low": -degrees(180), "high": degrees(180)}, ""),  # a full turn: values wrap
+        ({"high": degrees(359.5), "uncertainty": degrees(0.5)}, ""),
+        ({"high": degrees(359.5), "uncertainty": degrees(0.3)}, "its point of 359.9 ° is beyond the high limit"),
+        ({"high": degrees(359.5), "uncertainty": math.nan}, "its point of 359.9 ° is beyond the high limit"),
+        ({"high": math.nan}, ""),
+    ):
+        assert misfit(calibration, had, replace(had, **change), None)[: len(words) or 99] == words, change  # type: ignore[arg-type]
+    narrow = replace(had, high=degrees(90))
+    assert misfit(calibration, narrow, narrow, None) == "", "limits that stay are the guard's"
+    moves, motor = actuator()
+    assert misfit(moves, motor, replace(motor, low=-1.0), None) == ""
+    assert misfit(moves, motor, replace(motor, high=0.1), None) == (
+        "its point of 110 mm is beyond the high limit of 100 mm"
+    )

@@ -402,3 +402,48 @@ def test_what_a_file_leaves_out_is_the_profiles_or_the_usual(
     profile = replace(angle, channels=(replace(channel, calibration=replace(channel.calibration, **asked)),))  # type: ignore[arg-type]
     found = read_calibrations(text, "c.csv", profile)[1]
     assert (found.method, found.inputs[0].degree, found.interval) == (method, degree, interval)
+
+
+@pytest.mark.parametrize(
+    ("text", "method", "degrees"),
+    [
+        ("slope = 2\nboundaries = [1, 5]", "linear", (1,)),
+        ("coefficients = [0, 2]\nboundaries = [1, 5]", "linear", (1,)),
+        ("coefficients = [0, 2]\n[[inputs]]\nboundaries = [1, 5]\noffsets = [0]", "polynomial", (1,)),
+        ("method = 'linear'\ncoefficients = [0, 2]\n[[inputs]]\nboundaries = [1, 5]\noffsets = [0]", "linear", (1,)),
+        ("from,to,offset,c0,c1\n1,5,0,0,2\n", "table", (1,)),
+        ("1,10\n5,30\n9,50\n", "linear", (1,)),
+    ],
+)
+def test_every_form_is_of_an_actuator_or_of_a_sensor_as_its_channel_is(
+    text: str, method: str, degrees: tuple[int, ...]
+) -> None:
+    gripper = load_profile("gripper")
+    name = "c.csv" if text[0] in "f1" else "c.toml"
+    for number in (1, 2):
+        found = read_calibrations(text, name, gripper, channel=number)[number]
+        assert (found.actuator, found.method, found.channel) == (number == 1, method, number)
+        assert tuple(part.degree for part in found.inputs) == degrees
+        assert [part.channel for part in found.inputs] == [number]
+        if text[0] != "1":
+            assert found.inputs[0].boundaries == (1.0, 5.0)
+
+
+def test_a_line_without_boundaries_goes_over_raw_values_or_from_limit_to_limit() -> None:
+    gripper = load_profile("gripper")
+    ends = {n: read_calibrations("slope = 2", "c.toml", gripper, channel=n)[n].inputs[0].boundaries for n in (1, 2)}
+    assert ends == {1: (0.0, pytest.approx(110.0)), 2: (0.0, 4095.0)}
+
+
+def test_what_is_just_allowed(angle: Profile) -> None:
+    def read(text: str) -> Calibration:
+        return read_calibrations(f"slope = 1\n{text}", "c.toml", angle)[1]
+
+    assert read("uncertainty = 0").uncertainty is None
+    assert read("date = 1970-01-01").date == datetime(1970, 1, 1, tzinfo=UTC)
+    assert read("date = 2105-12-31").date == datetime(2105, 12, 31, tzinfo=UTC)
+    assert read("interval = 4294967295").interval == 4294967295
+    assert read("degree = 255").method == "linear"
+    assert pairs(f"1,2\n3,{'4'.rjust(19_998)}\n") == [(1.0, 2.0), (3.0, 4.0)]
+    with pytest.raises(BadDataError, match=r"c\.csv:2: the line has more than 20000 characters"):
+        pairs(f"1,2\n3,{'4'.rjust(19_999)}\n")

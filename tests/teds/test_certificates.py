@@ -174,6 +174,12 @@ def test_a_channel_must_be_named_if_the_type_has_several() -> None:
     force = changed(ANGLE, (r"\degree", r"\newton"))
     made = read_certified(force, "c.xml", hand, CertificateChoice(channel=2))
     assert list(made) == [2]
+    with pytest.raises(BadDataError, match=r"^tactile-finger-sensor has channels 1 to 12, not 13\.$"):
+        read_certified(force, "c.xml", hand, CertificateChoice(channel=13))
+    third = hand.channels[2]
+    free = [replace(channel, calibration=replace(channel.calibration, required=False)) for channel in hand.channels]
+    one = replace(hand, channels=(*free[:2], replace(third, calibration=replace(third.calibration, required=True))))
+    assert list(read_certified(force, "c.xml", one)) == [3], "the only one that requires a calibration"
 
 
 def test_rows_of_single_values_are_a_table_too(angle: Profile) -> None:

@@ -532,3 +532,45 @@ def test_differences_below_eight_steps_of_a_float32_are_noise(results: list[floa
     """One step is 2^-23 of the largest result."""
     curve: Any = SimpleNamespace(result=np.array(results))
     assert Curve.noise.fget(curve) == noise  # type: ignore[attr-defined]
+
+
+def test_gain_and_offset_that_were_alike_before_are_not_exchanged(tactile: Profile) -> None:
+    """To a quarter: else such a calibration could never be written again."""
+    part = CalibrationInput(1, 1, (0, 9), (0,))
+    alike = Calibration(1, "linear", (part,), (1.0, 1.1), unit=parse_unit("N"))
+    before, after = built(tactile, alike), built(tactile, replace(alike, coefficients=(1.1, 1.0)))
+    for new in (before, after):
+        assert "swapped" not in codes(check_calibration(new, before, tactile))
+
+
+def test_a_change_is_a_share_of_the_range_from_its_low_to_its_high_limit() -> None:
+    """Of 200 N between -100 and 100 N."""
+    profile = load_profile("load-cell", [shipped_profiles()])
+    low, high = profile.channels[0].low_limit, profile.channels[0].high_limit
+    assert low == -high < 0
+    part = CalibrationInput(1, 1, (0, 16777215), (0,))
+    line = Calibration(1, "linear", (part,), (low, (high - low) / 16777215), unit=parse_unit("N"))
+    found = check_calibration(built(profile, replace(line, zero_offset=0.3 * high)), built(profile, line))
+    assert "(15 % of the range)" in text(found, "changed")
+
+
+def test_a_result_that_rises_where_it_must_fall_says_so(tactile: Profile) -> None:
+    falling = force_line(10.0, -10 / 65535, monotone="decreasing")
+    assert said(built(tactile, falling)) == []
+    (rises,) = said(built(tactile, force_line(monotone="decreasing")))
+    assert rises == (
+        "error",
+        "reversed",
+        "the result rises by 10 N from raw 0 to raw 65535; its type says that it must be decreasing",
+    )
+    table = replace(fit([(0, 10.0), (30000, 5.5), (65535, 0.0)], "table", channel=1), unit=parse_unit("N"))
+    first, slope, *others = table.coefficients
+    bent = replace(table, coefficients=(first - 0.15, slope, *others), monotone="decreasing")
+    (wrong,) = said(built(tactile, bent))
+    assert wrong[:2] == ("error", "not-monotone")
+    assert wrong[2].startswith("the result rises by 0.149")
+
+
+def test_coefficients_without_points_have_no_residuals(tactile: Profile) -> None:
+    calibrations = {1: force_line(uncertainty=0.1)}
+    assert said(built(tactile, calibrations[1]), None, tactile, calibrations=calibrations) == []

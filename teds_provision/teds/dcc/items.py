@@ -190,7 +190,12 @@ def _is_raw(quantity: Quantity, channel: ChannelProfile) -> bool:
     """Return True if indications are raw numbers; of a channel without a unit only by their reference type."""
     if not _is_plain(quantity.unit):
         return False
-    return quantity.has_role("rawvalue") or not (_is_plain(channel.unit) or channel.units.interpretation == RATIO)
+    return _names_raw(quantity) or not (_is_plain(channel.unit) or channel.units.interpretation == RATIO)
+
+
+def _names_raw(quantity: Quantity) -> bool:
+    """Return True if a quantity is one of raw numbers by its reference type."""
+    return _is_plain(quantity.unit) and quantity.has_role("rawvalue")
 
 
 def _is_float(channel: ChannelProfile) -> bool:
@@ -274,7 +279,7 @@ def _uncertainty(item: CertificateItem, channel: ChannelProfile, points: Sequenc
     """
     found = [_largest_uncertainty(item.table, channel.unit)]
     indicated = item.indicated
-    if indicated is not None and indicated.standard_uncertainty and not _same_kind(indicated.unit, channel.units):
+    if indicated is not None and indicated.standard_uncertainty and _is_raw(indicated, channel):
         steps = [(after[0] - before[0], after[1] - before[1]) for before, after in pairwise(points)]
         slopes = [abs(rise / run) for run, rise in steps if run > 0]
         found.append(indicated.standard_uncertainty * indicated.unit.scale * max(slopes, default=0.0))
@@ -282,10 +287,13 @@ def _uncertainty(item: CertificateItem, channel: ChannelProfile, points: Sequenc
 
 
 def _largest_uncertainty(table: ResultTable, unit: WrittenUnit) -> float | None:
-    """Return the largest standard uncertainty of the quantities of one kind in a table, in this unit."""
+    """Return the largest standard uncertainty of the quantities of one kind in a table, in this unit.
+
+    One of raw numbers is of another kind, also where the unit is a plain number itself.
+    """
     stated = [
         _difference(quantity.standard_uncertainty, quantity.unit, unit)
         for quantity in table.quantities
-        if quantity.standard_uncertainty and _same_kind(quantity.unit, unit.units)
+        if quantity.standard_uncertainty and _same_kind(quantity.unit, unit.units) and not _names_raw(quantity)
     ]
     return max(stated, default=None)
