@@ -8,6 +8,7 @@ import pytest
 from tests.e2e.desk import ANGLE
 
 from .lab import GRIPPER, QUIET, Lab, chromium
+from .stage import Stage, staged
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -51,3 +52,26 @@ def fresh(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
         yield lab
     finally:
         lab.desk.clear()
+
+
+MODULES = (
+    "format", "shapes", "ring", "past", "api", "dom", "live", "plot", "views/actuator", "views/bulk", "views/datasheet",
+    "views/facts", "views/feed", "views/filters", "views/history", "views/line", "views/links", "views/log",
+    "views/measure", "views/node", "views/nodes", "views/provision", "views/rates", "views/setpoints", "views/station",
+    "views/update", "views/values", "views/virtual", "views/write",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="package")
+def modules(browser: Browser) -> Iterator[Stage]:
+    """Yield the page's modules in one page, without a station."""
+    with staged(browser, *MODULES) as stage:
+        yield stage
+
+
+@pytest.fixture
+def stage(modules: Stage) -> Iterator[Stage]:
+    """Yield them with a station that has nothing; an error in the page fails the test."""
+    modules.reset()
+    yield modules
+    assert not modules.wrong, modules.wrong

@@ -88,6 +88,9 @@ export function chip(tone, sign, words, title) {
 export function keyed(parent, items, keyOf, make, update) {
   const old = parent.keyed ?? new Map();
   const now = new Map();
+  const focused = parent.contains(document.activeElement) ? document.activeElement : null;
+  const stay = new Set(items.map(keyOf));
+  for (const [key, element] of old) if (!stay.has(key)) element.remove(); // first: no other element has to move then
   let place = parent.firstChild;
   for (const item of items) {
     const key = keyOf(item);
@@ -98,8 +101,9 @@ export function keyed(parent, items, keyOf, make, update) {
     if (element === place) place = place.nextSibling;
     else parent.insertBefore(element, place);
   }
-  for (const [key, element] of old) if (!now.has(key)) element.remove();
   parent.keyed = now;
+  // an element that moves loses the focus
+  if (focused?.isConnected && document.activeElement !== focused) focused.focus({ preventScroll: true });
 }
 
 let numbered = 0;

@@ -52,7 +52,13 @@ export function short(value) {
   return sign(String(Number(value.toPrecision(4))));
 }
 
-const sign = (words) => words.replace("-", "\u2212");
+/** Four figures of a number, but never beyond the ends of its range: the station would refuse it. */
+export function within(value, low, high) {
+  const rounded = Number(value.toPrecision(4));
+  return rounded < (low ?? -Infinity) ? low : rounded > (high ?? Infinity) ? high : rounded;
+}
+
+const sign = (words) => words.replaceAll("-", "\u2212");
 
 /** "0 to 110 mm", "from 0 mm", or "not stated". */
 export function range(channel) {

@@ -332,7 +332,7 @@ function exact(time, width) {
 }
 
 const hours = (time) => (time === null ? "" : new Date(time * 1000).toTimeString().slice(0, 8));
-const tick = (value) => (value === null ? "" : String(Number(value.toPrecision(6))).replace("-", "\u2212"));
+const tick = (value) => (value === null ? "" : String(Number(value.toPrecision(6))).replaceAll("-", "\u2212"));
 
 /** Some room above and below; a constant curve gets a frame too. */
 function padded(_, low, high) {

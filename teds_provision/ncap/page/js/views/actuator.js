@@ -2,7 +2,7 @@
 
 import { change, paths } from "../api.js";
 import { chip, field, fill, h, icon, say, text, trouble } from "../dom.js";
-import { channelName, clock, nameOf, range, reading, short } from "../format.js";
+import { channelName, clock, nameOf, range, reading, within } from "../format.js";
 import { toShown, toSi } from "../shapes.js";
 import { now, on, state } from "../state.js";
 
@@ -55,12 +55,12 @@ export class ActuatorPanel {
       this.slider.step = (channel.high - channel.low) / 1000;
       this.slider.value = channel.low;
     }
-    this.entry.value = typeof channel.low === "number" ? short(channel.low).replace("\u2212", "-") : "0";
+    this.entry.value = typeof channel.low === "number" ? within(channel.low, channel.low, channel.high) : "0";
   }
 
   typed(from, to) {
     to.value = from.value === "" ? to.value : from.value;
-    if (from === this.slider) this.entry.value = String(Number(Number(from.value).toPrecision(4)));
+    if (from === this.slider) this.entry.value = within(Number(from.value), this.channel.low, this.channel.high);
   }
 
   listen() {

@@ -2,7 +2,7 @@
 
 import { sourceAddress } from "../api.js";
 import { button, chip, field, fill, h, keyed, say, text, trouble } from "../dom.js";
-import { clock, count, short } from "../format.js";
+import { clock, count, short, within } from "../format.js";
 import { state } from "../state.js";
 
 const EVERY = 50; // ms between two lines while a slider moves
@@ -92,7 +92,7 @@ export class Feed {
       take();
     });
     range?.addEventListener("input", () => {
-      entry.value = Number(Number(range.value).toPrecision(4));
+      entry.value = within(Number(range.value), channel.low, channel.high);
       take();
     });
     none.addEventListener("change", take);
