@@ -7,14 +7,21 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-from teds_provision.errors import BadDataError, NotFoundError, PolicyError, RosterExpiredError, TedsProvisionError
+from teds_provision.errors import (
+    BadDataError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
+    RosterExpiredError,
+    TedsProvisionError,
+)
 from teds_provision.plant import scram
 from teds_provision.plant.apply_pages import now, recount, require_roster
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
-from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, open_roster
+from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, names_other_ca, open_roster
 from teds_provision.provisioning.verify import snapshot_trust, verify_image
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.plant.pages import Chain
@@ -49,21 +56,28 @@ def request(station: Station) -> bytes:
 def found_roster(station: Station, transport: Transport, octets: bytes | None) -> Roster:
     """Return the best roster that names this station, of a file or of the transport; an expired one is refused here.
 
-    Raises NotFoundError, PolicyError.
+    Raises NotFoundError, NotAuthenticError, BadDataError, PolicyError (that of another CA: its stations are not ours).
     """
+    if octets is not None and names_other_ca(octets, station.ca):
+        raise _other_owner("The roster")
     found = [] if octets is None else [open_roster(octets, station.ca)]
+    foreign = False
     held = station.plant.roster
     if held is not None:  # the station is a member already, and changes its transport
         found.append(held)
     for roster_octets in transport.rosters() if octets is None else ():
         try:
             found.append(open_roster(roster_octets, station.ca))
+        except NotAuthenticError:
+            foreign = foreign or names_other_ca(roster_octets, station.ca)
         except TedsProvisionError:  # the transport is untrusted
             continue
     held = station.plant.roster
     if octets is None and held is not None:
         found.append(held)
     mine = [roster for roster in found if roster.member(station.fingerprint) is not None]
+    if foreign and not found:
+        raise _other_owner(f"Every roster in {transport.where}")
     if not mine:
         raise NotFoundError(
             f"No roster in {transport.where} that this owner's CA signed names this station.",
@@ -88,6 +102,13 @@ def found_roster(station: Station, transport: Transport, octets: bytes | None) -
             hint="Ask its owner to renew it: registry renew",
         )
     return best
+
+
+def _other_owner(what: str) -> PolicyError:
+    return PolicyError(
+        f"{what} is signed by another CA than this station's, so it cannot join.",
+        hint="A station without nodes can be set up again: init --request, trust ca sign, init --certificate",
+    )
 
 
 def disconnect(station: Station) -> None:

@@ -22,6 +22,7 @@ from teds_provision.protocol.plant.page import PageDraft, open_page, sign_page
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
+from tests.bench import make_station
 from tests.plant.owner import ALL, REGISTRY, alone, join, member, roster_of
 from tests.plant.plants import NOW
 from tests.plant.test_contract_states import H, held, others, paged
@@ -79,6 +80,18 @@ def test_the_newest_roster_that_names_this_station_is_joined(outsider: Station) 
         found_roster(outsider, carrying(third, elsewhere), None)
     with pytest.raises(NotAuthenticError):
         found_roster(outsider, carrying(), third.octets[:-6] + b"AAAAAA")
+
+
+def test_a_station_with_another_ca_is_refused_by_policy(outsider: Station, tmp_path: Path) -> None:
+    other = make_station(tmp_path / "other", "other")
+    foreign = roster_of(other, member(other, "other", *ALL))
+    other.close()
+    for carried, octets in ((carrying(), foreign.octets), (carrying(b"junk", foreign), None)):
+        with pytest.raises(PolicyError, match="signed by another CA than this station's") as error:
+            found_roster(outsider, carried, octets)
+        assert error.value.exit_code == 6
+    own = signed(outsider, 2)
+    assert found_roster(outsider, carrying(foreign, own), None) == own, "another owner's roster beside it does no harm"
 
 
 @pytest.mark.parametrize(("ends", "joins"), [(SECOND, True), (timedelta(0), False), (-SECOND, False)])

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any, Final, Literal
 
 from teds_provision.errors import BadDataError
-from teds_provision.protocol.handover.strict_json import base64url, time_text
+from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, load_exact, time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import ROSTER, Fields, is_form, is_name, open_document, sign_document
 
@@ -194,6 +194,13 @@ def open_roster(octets: bytes, ca: bytes) -> Roster:
     """Read a roster that this CA (65 octets) signed. Raises NotAuthenticError, BadDataError, NewerFormatError."""
     document = open_document(octets.strip(), lambda kid: ca if kid == fingerprint(ca) else None, ROSTER)
     return read_roster(document.members, ca, document.hash, document.octets)
+
+
+def names_other_ca(octets: bytes, ca: bytes) -> bool:
+    """Return True if a roster names another CA as its signer; nothing of it is verified."""
+    header = load_exact(decode_base64url(octets.strip().partition(b".")[0], "The JWS header"), "The JWS header")
+    kid = header.get("kid")
+    return header.get("typ") == ROSTER.typ and is_form("sha256", kid) and kid != fingerprint(ca)
 
 
 def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"") -> Roster:
