@@ -32,15 +32,23 @@ class RevokeResult:
     fresh: bool
 
 
+def already_revoked(station: Station, uuid: bytes) -> RevokeResult | None:
+    """Return the ban of a node if nothing of it is left to revoke here, else None."""
+    present = station.policy.revocation(uuid)
+    if present is None or station.keys.held(uuid) or station.pins.entry(uuid) is not None:
+        return None
+    return RevokeResult(present, fresh=False)
+
+
 def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
     """Ban a node's key: off the whitelist, its keys deleted, and a signed statement that travels in every bundle."""
     if not why.strip() or not is_label(why):
         raise UsageError("Give the reason, in printable text of at most 1,024 characters.")
-    present = station.policy.revocation(uuid)
-    if present is not None and not station.keys.held(uuid) and station.pins.entry(uuid) is None:
-        return RevokeResult(present, fresh=False)
+    done = already_revoked(station, uuid)
+    if done is not None:
+        return done
     statement = None
-    if present is None:
+    if station.policy.revocation(uuid) is None:
         now = datetime.now(UTC)
         key = station.vault.identity()
         pinned = station.pins.pinned(uuid)

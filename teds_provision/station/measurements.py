@@ -179,6 +179,11 @@ class Measurements:
         """Remove a kept measurement, from the next start on; False if there is none. Ends nothing that runs."""
         return self._store.change("DELETE FROM measurements WHERE id = ?", (measurement_id,)) > 0
 
+    def has_node(self, uuid: bytes) -> bool:
+        """Return True if a node is in a group, in a measurement, or has a chosen name: what ``hand_on`` moves."""
+        named = any(node == uuid for node, _ in (*self.names, *self.frames))
+        return named or bool(self._groups.names_of_node(uuid)) or any(uuid in row.uuids for row in self._rows())
+
     def hand_on(self, old: bytes, new: bytes | None) -> HandedOn:
         """Put ``new`` in the place of ``old`` in groups, chosen names, frames and measurements; None removes ``old``.
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from teds_provision.cli.context import App
+from teds_provision.handover.life import DECOMMISSIONED
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.station.station import Station
 from teds_provision.station.store.lock import _HeldFile
@@ -125,6 +126,29 @@ def test_a_plan_of_what_is_finished_says_so_too(home: Path, tmp_path: Path, word
     more = {"whitelist": [ONE], "trust": ["lab"], "group": ["hand", ONE]}[words[0]]
     assert call(home, *words, *more, *(["--yes"] if words[0] == "trust" else [])).code == 0
     assert call(home, "--json", *words, *more, "--dry-run").code == 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("revoke", ONE, "--why", "stolen", "--yes"),
+        ("decommission", ONE, "--yes"),
+        ("replace", ONE, SPARE, "--yes"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_plan_of_a_finished_end_of_life_is_what_the_command_prints(home: Path, words: tuple[str, ...]) -> None:
+    call(home, "whitelist", "add", SPARE)
+    with Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE) as station, station.transaction():
+        retired = DECOMMISSIONED if words[0] == "decommission" else None
+        station.nodes.remember(bytes.fromhex(ONE), retired=retired)
+    if words[0] != "decommission":
+        assert call(home, *words).code == 0
+    before = rows(home), entries(home)
+    plan = call(home, "--json", *words, "--dry-run")
+    assert (rows(home), entries(home)) == before
+    assert (plan.code, plan.json["fresh"]) == (0, False)
+    assert plan.json == call(home, "--json", *words).json
 
 
 def test_no_passphrase_is_asked_for_while_a_lock_is_held(

@@ -14,12 +14,22 @@ from teds_provision.cli.rendering import reporter_for
 from teds_provision.cli.station.handover import require_same
 from teds_provision.errors import FrozenError, LinkError, PolicyError
 from teds_provision.handover import deny, life
-from teds_provision.handover.life import TakeoverPlan, hand_on, is_finished, plan_takeover, retire, take_over
+from teds_provision.handover.life import (
+    RevokeResult,
+    TakeoverPlan,
+    hand_on,
+    is_finished,
+    plan_takeover,
+    retire,
+    take_over,
+)
 from teds_provision.links import LinkSettings
 from teds_provision.provisioning.agree import ResetReceipt
 from teds_provision.sanitize import counted
 from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
+
+_TAKEN_OVER = "Nothing to do: it has already taken over."
 
 
 @command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
@@ -43,6 +53,10 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
         _lift(app, station, octets, yes=yes, dry_run=dry_run)
         return
     assert why is not None
+    done = life.already_revoked(station, octets)
+    if done is not None:
+        _print_revoked(app, done)
+        return
     if dry_run:
         keys = len(station.keys.keys_of(octets))
         app.emit(
@@ -55,14 +69,19 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
         app.confirm(f"Revoke node {octets.hex()}? Its keys will be deleted here.", yes=yes)
     with station.lock("revoke", app.note):
         done = life.revoke(station, octets, why)
+    _print_revoked(app, done)
+
+
+def _print_revoked(app: App, done: RevokeResult) -> None:
+    node = done.entry.uuid.hex()
     result = {
-        "uuid": octets.hex(),
+        "uuid": node,
         "fingerprint": done.entry.fingerprint,
         "why": done.entry.why,
         "created": done.entry.created,
         "fresh": done.fresh,
     }
-    app.emit(result, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (already known)."))
+    app.emit(result, f"Node {node} is revoked: {done.entry.why}" + ("" if done.fresh else " (already known)."))
 
 
 def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
@@ -108,13 +127,13 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     station = app.station()
     octets = station.nodes.resolve(uuid)
     station.policy.require_not_given_away(octets)
-    if dry_run:
-        app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
-        return
     if is_finished(station, octets):
         app.emit(
             _result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is already out of service."
         )
+        return
+    if dry_run:
+        app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
     station.unlock()
     app.confirm(
@@ -207,6 +226,9 @@ def replace(
     shown = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
     result, text = _takeover(shown)
     result["groups"] = station.groups.names_of_node(spare if shown.done else octets)
+    if dry_run and shown.done and not station.measurements.has_node(octets):
+        app.emit({**result, "moved": HandedOn().to_json(), "fresh": False}, _TAKEN_OVER)
+        return
     if dry_run:
         app.emit({**result, "plan": True}, f"Plan: {text}.")
         return
@@ -225,7 +247,7 @@ def replace(
             warnings, moved = take_over(station, plan, receipt)
     if plan.done:
         rest = _handed_on(moved, "Moved")
-        text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
+        text = "It has already taken over." if rest else _TAKEN_OVER
         app.emit({**result, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
         return
     for warning in warnings:
