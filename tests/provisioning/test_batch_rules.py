@@ -468,6 +468,14 @@ def test_only_a_row_that_has_passed_is_done_again_and_told_so(station: Station, 
     assert [changed.has_passed(uuid_of(number)) for number in (1, 2)] == [False, False]
     changed.note(changed.sheet.rows[0], BoardResult(uuid_of(1), 1.0, row=1))
     assert now("name\nc\nd\n").again == (), "it was done again"
+    (station.home / "profiles").mkdir()
+    own = station.home / "profiles" / "own.toml"
+    own.write_text('extends = "load-cell"\n')
+    failed = now("name,profile\na,own\n")
+    failed.note(failed.sheet.rows[0], BoardResult(uuid_of(1), 1.0, error=NodeSilentError("Pulled."), row=1))
+    own.write_text('extends = "load-cell"\n[channel.1]\nuncertainty = 0.4\n')
+    later = now("name,profile\na,own\n")
+    assert (later.again, later.rows[1].tries) == ((), 1), "a row that failed is tried again in any case"
     assert progress.has_passed(uuid_of(1))
     assert not progress.has_passed(uuid_of(2))
     assert not progress.has_passed(uuid_of(3))

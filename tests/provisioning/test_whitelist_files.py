@@ -455,3 +455,63 @@ def test_a_whitelist_has_a_quarter_of_a_million_entries_and_no_more() -> None:
     assert (reader.mistakes, len(reader.entries)) == ([], 1)
     with pytest.raises(BadDataError, match=r"list\.csv:2: there are more than 250000 entries"):
         reader.add(2, {"uuid": "8d4d9da65281f7000001"})
+
+
+@pytest.mark.parametrize(
+    ("text", "entries"),
+    [
+        # an element of our name whose text is the UUID, with the key as its attribute
+        (f'<whitelist><uuid fingerprint="{KEY}">{ONE.hex()}</uuid></whitelist>', [(ONE, KEY, None)]),
+        # the document is one entry
+        (f"<tim><uuid>{ONE.hex()}</uuid><fingerprint>{KEY}</fingerprint></tim>", [(ONE, KEY, None)]),
+        (f'<tim fingerprint="{KEY}" name="a">{ONE.hex()}</tim>', [(ONE, KEY, "a")]),
+        # names with a prefix, below one another
+        (f"<w:a xmlns:w='u'><w:b><w:UUID>{ONE.hex()}</w:UUID><w:name>a</w:name></w:b></w:a>", [(ONE, None, "a")]),
+        # a name that several have is the list's own
+        (f'<list name="crane"><uuid>{ONE.hex()}</uuid><uuid>{TWO.hex()}</uuid></list>',
+         [(ONE, None, None), (TWO, None, None)]),
+        (f"\n \n<uuids>{ONE.hex()}; {TWO.hex()}</uuids>", [(ONE, None, None), (TWO, None, None)]),
+        (f'\n  ["{ONE.hex()}"]', [(ONE, None, None)]),
+        (f'\n  {{"whitelist": ["{ONE.hex()}"]}}', [(ONE, None, None)]),
+        # what another program lists beside ours
+        (json.dumps([{"uuid": ONE.hex(), "epoch": 3, "name": None, "keys": []}]), [(ONE, None, None)]),
+        (json.dumps([{"ID": ONE.hex(), "name": "a"}]), [(ONE, None, "a")]),
+        # a remark says nothing of how the lines are separated, and empty cells at the end say nothing
+        (f"# one; two; three; four\nuuid,name\n{ONE.hex()},a;b\n", [(ONE, None, "a;b")]),
+        (f"{ONE.hex()},{KEY},a,,\n{TWO.hex()},,,,\n", [(ONE, KEY, "a"), (TWO, None, None)]),
+        (f"uuid\tname\n{ONE.hex()}\ta, b\n", [(ONE, None, "a, b")]),
+    ],
+)  # fmt: skip
+def test_lists_of_other_programs_are_read_for_what_they_mean(
+    tmp_path: Path, text: str, entries: list[tuple[bytes, str | None, str | None]]
+) -> None:
+    assert [(entry.uuid, entry.fingerprint, entry.name) for entry in read(tmp_path, text)] == entries
+
+
+def test_of_one_node_listed_twice_the_longer_of_its_digits_and_the_name_count(tmp_path: Path) -> None:
+    for lines in ((f"{KEY[:32]},", f"{KEY},a"), (f"{KEY},a", f"{KEY[:40]},b"), (",", f"{KEY},a")):
+        found = read(tmp_path, "".join(f"{ONE.hex()},{line}\n" for line in lines))
+        assert [(entry.line, entry.fingerprint, entry.name) for entry in found] == [(1, KEY, "a")]
+
+
+def test_a_new_entry_keeps_the_name_that_a_list_gives_it_and_a_known_one_does_not_take_the_nodes_own(
+    station: Station,
+) -> None:
+    """Exports show the node's own name where an entry has none; imported again, that changes nothing."""
+    station.nodes.remember(ONE, name="own")
+    (new,) = plan_addition(station, [ListedNode(1, ONE, name="own")]).write
+    assert new.name == "own"
+    put(station, ListedNode(1, ONE))
+    assert plan_addition(station, [ListedNode(1, ONE, name="own")]).write == ()
+    assert plan_addition(station, [ListedNode(1, ONE, name="own")], rename=True).write == ()
+    (named_now,) = plan_addition(station, [ListedNode(1, ONE, name="other")]).write
+    assert named_now.name == "other"
+    add(station, plan_addition(station, [ListedNode(1, ONE, name="other")]), source="x")
+    assert plan_addition(station, [ListedNode(1, ONE, name="third")]).write == ()
+    (renamed,) = plan_addition(station, [ListedNode(1, ONE, name="third")], rename=True).write
+    assert renamed.name == "third"
+
+
+def test_a_name_that_xml_cannot_hold_is_still_written_and_read_back() -> None:
+    text = "".join(render([WhitelistEntry(ONE, None, "2026-11-28T01:02:03Z", "uuid", "a\x01b\nc")], "xml"))
+    assert 'name="a\ufffdb\ufffdc"/>' in text
