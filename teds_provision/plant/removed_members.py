@@ -53,7 +53,7 @@ def review(station: Station, roster: Roster, now: datetime) -> RemovalReview | N
     before = last(station)
     if before is not None and before.removed == named and abs(now - datetime.fromisoformat(before.at)) < EVERY:
         return before
-    ours = _first_removals(station)
+    ours = _first_removals(station, now)
     beyond = _beyond(station, roster)
     of = 0
     for page in _pages(station):
@@ -198,22 +198,28 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
     return found
 
 
-def _first_removals(station: Station) -> dict[str, datetime]:
-    """Return since when this station knows of each removal."""
+def _first_removals(station: Station, now: datetime) -> dict[str, datetime]:
+    """Return since when this station knows of each removal.
+
+    A roster that a clock which was ahead dates after ``now`` counts from its own date: another holder's turn must end.
+    """
     since: dict[str, datetime] = {}
     for row in station.plant.rosters():
-        for fingerprint in _removed_in(row.octets, station.ca):
+        created, fingerprints = _removals_in(row.octets, station.ca)
+        for fingerprint in fingerprints:
             at = datetime.fromisoformat(row.at)
-            since[fingerprint] = min(since.get(fingerprint, at), at)
+            known = at if at <= now else created
+            since[fingerprint] = min(since.get(fingerprint, known), known)
     return since
 
 
 @lru_cache(maxsize=64)
-def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
+def _removals_in(octets: bytes, ca: bytes) -> tuple[datetime, frozenset[str]]:
     try:
-        return frozenset(removed.fingerprint for removed in open_roster(octets, ca).removed)
+        roster = open_roster(octets, ca)
     except TedsProvisionError:  # stored only as proof that there were two rosters of one version
-        return frozenset()
+        return datetime.max.replace(tzinfo=UTC), frozenset()
+    return roster.created, frozenset(removed.fingerprint for removed in roster.removed)
 
 
 def _alone(station: Station, roster: Roster) -> int:

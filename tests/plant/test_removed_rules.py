@@ -97,8 +97,18 @@ def test_a_removal_is_known_since_the_first_roster_here_that_has_it(station: Sta
                                  (4, (LOST, STOLEN), "2026-03-05T00:00:00Z")):  # fmt: skip
         made = roster_of(station, own, version=version, previous="ab" * 32, removed=removed)
         station.plant.put_roster(RosterRow(version, made.hash, made.octets, True, at))
-    second = datetime(2026, 3, 2, tzinfo=UTC)
-    assert _first_removals(station) == {LOST.fingerprint: second, STOLEN.fingerprint: second}
+    second, sixth = datetime(2026, 3, 2, tzinfo=UTC), datetime(2026, 3, 6, tzinfo=UTC)
+    assert _first_removals(station, sixth) == {LOST.fingerprint: second, STOLEN.fingerprint: second}
+
+
+def test_a_removal_that_a_clock_ahead_took_in_is_known_since_the_roster_was_made(station: Station) -> None:
+    """Else the turn of a holder that never comes would last until that date."""
+    own = member(station, "owner", *ALL)
+    made = roster_of(station, own, version=2, previous="ab" * 32, removed=(LOST,))
+    station.plant.put_roster(RosterRow(2, made.hash, made.octets, True, "2027-03-02T00:00:00Z"))
+    assert _first_removals(station, made.created + DAY) == {LOST.fingerprint: made.created}
+    exactly = datetime(2027, 3, 2, tzinfo=UTC)
+    assert _first_removals(station, exactly) == {LOST.fingerprint: exactly}
 
 
 def test_the_key_that_is_held_is_the_active_one_or_the_newest_copy(station: Station) -> None:
