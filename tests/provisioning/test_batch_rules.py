@@ -468,6 +468,17 @@ def test_only_a_row_that_has_passed_is_done_again_and_told_so(station: Station, 
     assert [changed.has_passed(uuid_of(number)) for number in (1, 2)] == [False, False]
     changed.note(changed.sheet.rows[0], BoardResult(uuid_of(1), 1.0, row=1))
     assert now("name\nc\nd\n").again == (), "it was done again"
+    assert progress.has_passed(uuid_of(1))
+    assert not progress.has_passed(uuid_of(2))
+    assert not progress.has_passed(uuid_of(3))
+
+
+def test_a_row_that_failed_is_no_row_that_is_done_again(station: Station, tmp_path: Path) -> None:
+    """It is tried again in any case, and keeps its tries."""
+
+    def now(text: str) -> Progress:
+        return Progress(station.home, read_sheet(station, sheet(tmp_path, text), CELL))
+
     (station.home / "profiles").mkdir()
     own = station.home / "profiles" / "own.toml"
     own.write_text('extends = "load-cell"\n')
@@ -476,9 +487,6 @@ def test_only_a_row_that_has_passed_is_done_again_and_told_so(station: Station, 
     own.write_text('extends = "load-cell"\n[channel.1]\nuncertainty = 0.4\n')
     later = now("name,profile\na,own\n")
     assert (later.again, later.rows[1].tries) == ((), 1), "a row that failed is tried again in any case"
-    assert progress.has_passed(uuid_of(1))
-    assert not progress.has_passed(uuid_of(2))
-    assert not progress.has_passed(uuid_of(3))
 
 
 @pytest.mark.parametrize(
