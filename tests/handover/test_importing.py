@@ -50,9 +50,12 @@ def test_a_bundle_for_another_station_or_from_a_stranger(pair: Pair, tmp_path: P
     path, _ = pair.export("copy")
     with pytest.raises(PolicyError, match="not sealed for this station"):
         plan_import(west, path.read_bytes())
-    pair.south.policy.distrust("north")
-    with pytest.raises(NotAuthenticError, match="not trusted here"):
-        plan_import(pair.south, path.read_bytes())
+    for role in ("station", "ca"):
+        pair.south.policy.distrust("north")
+        with pytest.raises(NotAuthenticError, match="not trusted here"):
+            plan_import(pair.south, path.read_bytes())
+        if role == "station":  # as a CA a key sends no bundle
+            pair.south.policy.trust(TrustRecord("north", "ca", pair.north.point, pair.north.fingerprint))
     west.close()
 
 
@@ -281,8 +284,26 @@ def test_whose_statement_bans_a_node_here(pair: Pair) -> None:
         return why_not(south, statement, bundle)
 
     assert why() == "this node is unknown here"
+    south.identity.put_certificate(fingerprint(south.ca), signer, bytes(64))
+    assert why(signer, None, brought, sender=signer) == why(signer, pinned, brought, sender=signer) == ""
+    assert "has another" in why(signer, "cd" * 32, brought, sender=signer), "it is held against the key that comes"
+    assert why(signer, None, brought, sender="5c" * 32).endswith("has no authority over this node"), (
+        "certified by the owner's CA, but nobody knows here which CA the node keeps"
+    )
     south.pins.put(WhitelistEntry(uuid, pinned, assurance="tap"))
     nobody = f"station {signer[:32]} has no authority over this node"
+    assert why() == "", "it is certified by the CA that the node keeps"
+    south.policy.distrust("lab")
+    assert why() == nobody, "a key that is not trusted"
+    south.policy.trust(TrustRecord("lab", "ca", key.point, signer))
+    assert why() == nobody, "a CA is no station"
+    south.policy.distrust("lab")
+    south.policy.trust(TrustRecord("lab", "station", key.point, signer))
+    south.pins.remove(uuid)
+    south.nodes.remember(uuid, state=1)
+    assert why(signer, None, brought) == "", "a node that was seen here is known, on the whitelist or not"
+    south.pins.put(WhitelistEntry(uuid, pinned, assurance="tap"))
+    south.keys.set_ca_of(uuid, ca.point)
     assert why() == nobody
     assert why(south.fingerprint) == why(signer, None, brought, sender=signer) == ""
     assert why(signer, None, brought, sender="5c" * 32) == nobody, "another one's bundle"
@@ -305,8 +326,6 @@ def test_whose_statement_bans_a_node_here(pair: Pair) -> None:
     assert why() == nobody
 
     south.identity.put_certificate(fingerprint(ca.point), signer, bytes(64))
-    assert why() == nobody, "the node keeps another CA"
-    south.keys.set_ca_of(uuid, ca.point)
     assert why() == ""
     south.policy.distrust("lab")
     assert why() == nobody

@@ -69,8 +69,16 @@ def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) 
     for short in (digits[:6], digits[:7]):
         with pytest.raises(NotFoundError):
             find_trusted(north, short)
-    with pytest.raises(NotFoundError):
+    with pytest.raises(NotFoundError, match="No trusted key is known as 'lab'"):
         find_trusted(north, "lab", "ca")
+    remove(north, find_trusted(north, "lab"))
+    add(north, [candidate(north, "owner", path, "ca")])
+    assert (north.policy.station_points(), north.policy.trusted_stations()) == ({}, [north.point])
+    for text in ("owner", digits[:16]):
+        with pytest.raises(NotFoundError, match=f"No trusted station is known as '{text}'"):
+            find_trusted(north, text, "station")
+    with pytest.raises(PolicyError, match="is not trusted here"):
+        find_trusted(north, str(path), "station")
 
 
 @pytest.mark.parametrize(

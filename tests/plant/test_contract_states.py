@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
+from teds_provision.handover import deny
 from teds_provision.plant import (
     apply_pages,
     doctor,
@@ -33,6 +34,7 @@ from teds_provision.protocol.plant.document import MemberRequest
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share
 from teds_provision.station.plant.pages import PageRow
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import Holder, TrustRecord, WhitelistEntry
 from tests.cli.shell import call
 from tests.plant.owner import ALL, alone, ca_of, join, member, roster_of
 from tests.plant.stations import LOGIN
@@ -488,3 +490,34 @@ def test_a_first_roster_has_this_station_alone_with_every_role_but_audit_for_90_
     [me] = made.members
     assert (me.fingerprint, me.roles) == (fingerprint(station.point), frozenset({"keeper", "sign", "line", "base"}))
     assert me.signed is None
+
+
+def test_among_members_a_keepers_ban_in_a_bundle_counts_and_no_certificate(station: Station) -> None:
+    """The CA certifies every member; who has had the node's key has authority as outside of a plant."""
+    west, south, east = others(station, west="keeper", south="base sign line", east="base")
+    held(station, west, south, removed=(RemovedMember("east", east.point, frozenset({"keeper"}), "lost", (0, "")),))
+    station.pins.put(WhitelistEntry(NODE, "cd" * 32, assurance="tap"))
+    bundle: Any = SimpleNamespace(nodes=(), sender="")
+
+    def why(of: Member) -> str:
+        statement: Any = SimpleNamespace(uuid=NODE, fingerprint=None, statement="a ban", sender=of.fingerprint)
+        return deny.why_not(station, statement, bundle)
+
+    assert why(west) == ""
+    for other in (south, east):
+        station.identity.keep_certificate(station.ca, other.point, other.certificate)
+        assert why(other) == f"station {other.fingerprint[:32]} has no authority over this node"
+    station.keys.put_holder(Holder(NODE, south.fingerprint, "2026-01-31T12:00:00Z"))
+    assert why(south) == ""
+
+
+def test_a_key_that_is_trusted_as_a_ca_signs_no_datasheets_in_a_plant(station: Station) -> None:
+    held(station)
+    for number, role in ((61, "ca"), (62, "station")):
+        key = SoftwareKey(number)
+        station.policy.trust(TrustRecord(f"lab {role}", role, key.point, fingerprint(key.point)))  # type: ignore[arg-type]
+    rules = station.policy.signer_rules()
+    assert rules is not None
+    assert rules.added == {fingerprint(SoftwareKey(62).point)}
+    verdicts = [rules.signing(station.ca, SoftwareKey(number).point, bytes(40)) for number in (61, 62)]
+    assert [verdict is not None and verdict.result == "passed" for verdict in verdicts] == [False, True]
