@@ -593,3 +593,26 @@ def test_a_board_that_is_not_authentic_has_failed_and_its_verdict_goes_before_it
     assert (kept.result, kept.message) == ("failed", board.failure.message)
     assert isinstance(progress.totals().error, NotAuthenticError)
     assert progress.totals().steps == {}
+
+
+@pytest.mark.parametrize(
+    ("request_", "limited"),
+    [({"sheet": True}, True), ({"sheet": True, "watch": True}, False), ({"sheet": True, "whole_bus": True}, False),
+     ({"watch": True}, False), ({"whole_bus": True}, False), ({}, False)],
+)  # fmt: skip
+def test_the_wait_for_the_next_board_is_limited_for_a_sheet_alone(
+    station: Station, tmp_path: Path, request_: dict[str, Any], limited: bool
+) -> None:
+    file = sheet(tmp_path, f"uuid\n{uuid_of(1).hex()}\n")
+    request = ProvisionRequest(order=CELL, **request_ | ({"sheet": file} if "sheet" in request_ else {}))
+    run = BatchRun(station, LinkSettings("can", timeout=0.0), request, SilentReporter())
+    assert run.stop.is_set() == limited
+
+
+def test_a_name_that_another_node_has_is_refused_before_the_named_one_is_waited_for(station: Station) -> None:
+    station.nodes.remember(uuid_of(1), name="own")
+    station.nodes.remember(uuid_of(2), name="taken")
+    request = ProvisionRequest(uuid_of(1).hex(), replace(CELL, name="taken"))
+    with pytest.raises(PolicyError, match=rf"^Node {uuid_of(2).hex()} already has the name 'taken'\.$"):
+        BatchRun(station, LinkSettings(), request, SilentReporter())
+    BatchRun(station, LinkSettings(), replace(request, order=replace(CELL, name="own")), SilentReporter())

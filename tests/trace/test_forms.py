@@ -377,3 +377,56 @@ def test_a_frame_has_the_time_of_its_arrival_however_late_it_is_written_down(nam
     came, left = read_trace(tmp_path / name)
     assert before - 1 < came.time + 3600 < after + 1
     assert before - 1 < left.time < after + 1
+
+
+def le_block(kind: int, body: bytes) -> bytes:
+    return le(kind, len(body) + 12) + body + le(len(body) + 12)
+
+
+def test_a_capture_in_several_sections_counts_the_interfaces_of_each_anew() -> None:
+    section = le_block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    ethernet, nfc = (le_block(1, struct.pack("<HHI", link_type, 0, 0)) for link_type in (1, 264))
+    frame = packet(0, 1_500_000, b"\0\xfa\0\2\xe0\x80", b"")
+    (record,) = pcapng.read_pcapng(section + ethernet + frame + section + nfc + frame)
+    assert (record.link, record.octets, record.time) == ("nfc", b"\xe0\x80", 1.5)
+
+
+@pytest.mark.parametrize(
+    ("flags", "direction"), [(1, "in"), (2, "out"), (0, "in"), (0b0110, "out"), (0b0101, "in"), (2 | 4 << 5, "out")]
+)
+def test_the_direction_is_two_bits_of_the_flags_of_a_packet(flags: int, direction: str) -> None:
+    data = b"\x98\xda\x21\xf1\2\0\0\0\1\2"
+    (record,) = pcapng.read_pcapng(pcapng.head() + packet(0, 0, data, option(2, le(flags)) + END))
+    assert record.direction == direction
+
+
+@pytest.mark.parametrize(
+    ("data", "octets", "fd"),
+    [
+        (b"\x98\xda\x21\xf1\2\0\0\0\1\2\0\0\0\0\0\0", b"\1\2", False),  # the kernel gives all 8 octets of a frame
+        (b"\x98\xda\x21\xf1\2\4\0\0\1\2", b"\1\2", True),
+        (b"\x98\xda\x21\xf1\2\1\0\0\1\2", b"\1\2", False),
+        (b"\x98\xda\x21\xf1\x0c\0\0\0" + bytes(12), bytes(12), True),  # a program that sets no flag
+    ],
+)
+def test_a_frame_of_the_bus_has_its_length_and_its_form(data: bytes, octets: bytes, fd: bool) -> None:
+    (record,) = pcapng.read_pcapng(pcapng.head() + packet(0, 0, data, OUT + END))
+    assert (record.octets, record.fd, record.identifier) == (octets, fd, 0x18DA21F1)
+
+
+@pytest.mark.parametrize("name", ["t.trace", "t.pcapng"])
+def test_a_message_that_was_not_opened_is_sealed_and_says_so(tmp_path: Path, name: str) -> None:
+    trace = open_trace(tmp_path / name, print)
+    trace.message("nfc", "in", b"\1", "reply", uuid=NODE, sealed=True)
+    trace.message("nfc", "in", b"\2", "reply", uuid=NODE, sealed=True, opened=b"")
+    trace.message("nfc", "in", b"\3", "reply", uuid=NODE)
+    trace.close()
+    assert [(record.command, record.sealed, record.opened) for record in read_trace(tmp_path / name)] == [
+        ("reply, not opened", True, None), ("reply", True, b""), ("reply", False, None),
+    ]  # fmt: skip
+
+
+def test_four_octets_of_a_head_are_no_trace(tmp_path: Path) -> None:
+    (tmp_path / "t").write_bytes(b"\x0a\x0d\x0d\x0a")
+    with pytest.raises(BadDataError, match="is not a trace"):
+        read_trace(tmp_path / "t")
