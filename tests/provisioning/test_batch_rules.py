@@ -616,3 +616,35 @@ def test_a_name_that_another_node_has_is_refused_before_the_named_one_is_waited_
     with pytest.raises(PolicyError, match=rf"^Node {uuid_of(2).hex()} already has the name 'taken'\.$"):
         BatchRun(station, LinkSettings(), request, SilentReporter())
     BatchRun(station, LinkSettings(), replace(request, order=replace(CELL, name="own")), SilentReporter())
+
+
+def test_what_is_wrong_with_a_sheet_and_what_is_done_again_is_told_before_the_first_board(
+    station: Station, tmp_path: Path
+) -> None:
+    run = of_sheet(station, tmp_path, "name\na\n")
+    assert run.progress is not None
+    run.progress.assign_row(run.progress.sheet.rows[0], uuid_of(1))
+    run.progress.rows[1].result = "passed"
+    run.progress.save()
+    lacking = "the type requires a calibration, but the sheet gives none."
+    assert of_sheet(station, tmp_path, "name\nb\n").warnings == (
+        f"Row 1: {lacking}", "Row 1: provisioned again, because the sheet changed.",
+    )  # fmt: skip
+    assert run_of(station).warnings == ()
+
+
+@pytest.mark.parametrize(("state", "brings"), [(NodeState.FACTORY, True), (NodeState.PROVISIONED, False)])
+def test_a_plan_to_adopt_judges_what_a_board_brought_unless_it_has_a_datasheet(
+    station: Station, monkeypatch: pytest.MonkeyPatch, state: NodeState, brings: bool
+) -> None:
+    who = SimpleNamespace(uuid=uuid_of(1), whitelisted=None, state=state, security_teds=b"")
+    found = SimpleNamespace(image=Image(uuid_of(1), {}), identity=SimpleNamespace(state=state))
+    proposal = SimpleNamespace(changes=(), warnings=("proposed",), image=Image(uuid_of(1), {}))
+    brought = SimpleNamespace(errors=("an error",), warnings=("a warning",))
+    monkeypatch.setattr(batch, "examine", lambda *_: who)
+    monkeypatch.setattr(batch, "take_snapshot", lambda *_, **__: found)
+    monkeypatch.setattr(batch, "propose", lambda *_, **__: proposal)
+    monkeypatch.setattr(batch, "read_factory_datasheet", lambda *_, **__: brought)
+    plan = run_of(station, order=BuildOrder(adopt=True))._plan_for(None)  # type: ignore[arg-type]
+    assert plan.warnings == (("an error", "a warning") if brings else ("proposed",))
+    assert plan.steps[-5:] == ("build", "sign", "write", "verify", "check")
