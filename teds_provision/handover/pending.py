@@ -249,6 +249,15 @@ def signer_of(text: str) -> str:
         return ""
 
 
+def refused_in(text: str) -> frozenset[str]:
+    """Return the nodes (UUIDs in hex) that a receipt, verified on arrival, names as not taken in."""
+    try:
+        refused = load_object(decode_base64url(text.split(".")[1], "The receipt"), "The receipt").get("refused", [])
+    except (BadDataError, IndexError):
+        return frozenset()
+    return frozenset(str(node["uuid"]).lower() for node in refused)
+
+
 def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
     notes = BundleNotes.from_json(row.nodes)
     if receipt.to != station.fingerprint or receipt.sender not in row.peers:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from teds_provision.errors import BadDataError, TedsProvisionError
-from teds_provision.handover.pending import UNDONE, BundleNotes
+from teds_provision.handover.pending import UNDONE, BundleNotes, refused_in, signer_of
 from teds_provision.protocol.datasheet import signature_good
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import open_revocation
@@ -53,6 +53,8 @@ def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[PastEven
     for row in station.handovers.all():
         notes = BundleNotes.from_json(row.nodes)
         refused = {uuid for uuid, _ in notes.refused}
+        receipts = (row.receipt or "").split() if row.direction == "out" else ()
+        refused_by = {signer_of(receipt): refused_in(receipt) for receipt in receipts}
         for at, digits in enumerate(notes.uuids):
             uuid = bytes.fromhex(digits)
             held, node = keys.get(uuid), station.nodes.get(uuid)
@@ -65,7 +67,8 @@ def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[PastEven
             if row.direction == "in" and same and held is not None and held.source == "import":
                 yield "took", uuid, {**handed, "peer": row.peers[0]}
             elif row.direction == "out":
-                yield from (("gave", uuid, {**handed, "peer": peer}) for peer in row.peers)
+                takers = (peer for peer in row.peers if digits not in refused_by.get(peer, ()))
+                yield from (("gave", uuid, {**handed, "peer": peer}) for peer in takers)
 
 
 def firmware_reports(station: Station) -> Iterator[PastEvent]:
