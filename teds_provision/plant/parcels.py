@@ -8,6 +8,7 @@ taken in gives its receipt once more (contract/plant.md section 4).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, open_document
 from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.sanitize import counted
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
 from teds_provision.station.station import Station
@@ -43,6 +45,8 @@ _DAYS_OF_A_LINE: Final = 31
 _COMMAND: Final = "registry sync"
 _KEPT: Final = 64
 """Limit of parcels of one sender that wait here for an operator; the others stay in the registry."""
+_BY_SHARE: Final = "share"
+"""Detail of an outgoing copy that was made for a share of the roster, not by ``export-keys``."""
 OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
 _KINDS: Final = {JOB.typ: JOB, SIGN_REQUEST.typ: SIGN_REQUEST, SIGNED.typ: SIGNED}
 
@@ -319,8 +323,10 @@ def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]
 # -- outgoing ----------------------------------------------------------------------------------------------------------
 
 
-def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> str:
+def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime, *, by_share: bool = False) -> str:
     """Have a bundle of ``export-keys --send`` leave with the next sync; its id. The caller holds the lock.
+
+    ``by_share``: it is a copy that a share of the roster asks for.
 
     The same order again, while its parcel waits, gives the same parcel.
     """
@@ -331,24 +337,33 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> s
     sealed = outgoing.seal_export(station, plan, now)
     with station.transaction():
         outgoing.record_export(station, sealed)
-        parcel = _put_out(station, "bundle", peer, sealed.octets, plan.id, expires=plan.expires)
+        detail = _BY_SHARE if by_share else ""
+        parcel = _put_out(station, "bundle", peer, sealed.octets, plan.id, expires=plan.expires, detail=detail)
         station.plant.parcels.put_shared(
             ((leaving.uuid, leaving.epoch) for leaving in plan.nodes), peer, parcel, "sent"
         )
     return parcel
 
 
-def send_out(station: Station, transport: Transport, views: Views, now: datetime) -> int:
-    """Send what waits: copies that are due, receipts, what a person sent; returns how many parcels left."""
+@dataclass(frozen=True)
+class SentParcels:
+    """Number of parcels that left in a sync, and a sentence for each receiver whose parcels are held back."""
+
+    count: int
+    held_back: tuple[str, ...] = ()
+
+
+def send_out(station: Station, transport: Transport, views: Views, now: datetime) -> SentParcels:
+    """Send what waits: copies that are due, receipts, what a person sent."""
     roster = station.plant.roster
     if roster is None:
-        return 0
+        return SentParcels(0)
     _expire(station, now)
     _note_refused(station)
     if now < roster.expires:
         _make_copies(station, roster, views, now)
         _forget(station, roster, views)
-    return _send(station, roster, transport)
+    return _send(station, roster, transport, now)
 
 
 def waiting_out(station: Station) -> int:
@@ -363,18 +378,21 @@ def _put_out(
     document: bytes,
     about: str,
     expires: datetime | None = None,
+    detail: str = "",
 ) -> str:
     parcel = str(uuid4())
     until = time_text(expires or datetime.now(UTC) + timedelta(days=DAYS))
-    station.plant.parcels.put(ParcelRow(parcel, "out", to, kind, "ready", until, about), document)
+    station.plant.parcels.put(ParcelRow(parcel, "out", to, kind, "ready", until, about, detail), document)
     return parcel
 
 
-def _send(station: Station, roster: Roster, transport: Transport) -> int:
-    parcels, sent = station.plant.parcels, 0
+def _send(station: Station, roster: Roster, transport: Transport, now: datetime) -> SentParcels:
+    parcels, sent, held_back = station.plant.parcels, 0, Counter[str]()
     for row in parcels.all("out", "ready"):
-        if roster.member(row.peer) is None:
-            continue  # nothing is sent to a removed station; taking back a move to it is the operator's decision
+        why = _why_held_back(station, roster, row, now)
+        if why:
+            held_back[why] += 1
+            continue
         try:
             transport.send(Parcel(row.id, row.peer, parcels.document(row.id, "out"), row.expires, station.fingerprint))
         except PolicyError:
@@ -385,7 +403,27 @@ def _send(station: Station, roster: Roster, transport: Transport) -> int:
             else:
                 parcels.drop(row.id, "out")
         sent += 1
-    return sent
+    return SentParcels(sent, tuple(f"{counted(count, 'parcel')} held back: {why}" for why, count in held_back.items()))
+
+
+def _why_held_back(station: Station, roster: Roster, row: ParcelRow, now: datetime) -> str:
+    """Return why a parcel that was made earlier does not leave now, "" if it does.
+
+    The roster may have changed or expired since: a copy of keys leaves only under one that holds, a move is the
+    operator's decision.
+    """
+    name = roster.name_of(row.peer)
+    if roster.member(row.peer) is None:
+        return f"{name} is no member any more; to take back a move to it: handover undo ID"
+    handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
+    if handover is None or handover.mode != "copy":
+        return ""
+    if now >= roster.expires:
+        return f"keys for {name}, as the roster expired on {roster.expires:%Y-%m-%d}; ask its owner: registry renew"
+    shares = (share for share in roster.share if row.peer in sharing.receivers(roster, station.fingerprint, share))
+    if row.detail == _BY_SHARE and next(shares, None) is None:
+        return f"keys for {name}, as no share of the roster sends them there any more"
+    return ""
 
 
 def _expire(station: Station, now: datetime) -> None:
@@ -443,7 +481,7 @@ def _make_copies(station: Station, roster: Roster, views: Views, now: datetime) 
             # apart, since disputed nodes wait for the receiver's operator and must not delay the others
             for part in (clear, disputed):
                 for plan in outgoing.plan_copies(station, to, part, now, most=NODES) if part else ():
-                    send_export(station, plan, now)
+                    send_export(station, plan, now, by_share=True)
 
 
 def _due(

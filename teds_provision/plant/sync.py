@@ -157,7 +157,9 @@ def _parcels(station: Station, transport: Transport, roster: Roster, done: SyncR
     removed_members.review(station, roster, at)
     came = parcels.take_in(station, transport, seen, at)
     done.parcels_in, done.waiting = came.taken, came.waiting
-    done.parcels_out = parcels.send_out(station, transport, seen, at)
+    left = parcels.send_out(station, transport, seen, at)
+    done.parcels_out = left.count
+    done.remarks += left.held_back
 
 
 # -- this station's chain ----------------------------------------------------------------------------------------------

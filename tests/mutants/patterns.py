@@ -49,6 +49,20 @@ PATTERNS = (
         "tests/plant/test_parcels.py",
     ),
     Pattern(
+        "a copy that waits is not sent under an expired roster",
+        "_why_held_back",
+        "now >= roster.expires",
+        "False",
+        "tests/plant/test_parcels.py",
+    ),
+    Pattern(
+        "a copy that waits is not sent if no share names its receiver",
+        "_why_held_back",
+        "row.detail == _BY_SHARE and next(shares, None) is None",
+        "False",
+        "tests/plant/test_parcels.py",
+    ),
+    Pattern(
         "exported evidence keeps its file whatever its number is now",
         "export",
         "next((path for path in same if holds(path, row.document)), None)",

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from teds_provision.errors import RosterExpiredError
 from teds_provision.handover import incoming, life, outgoing
 from teds_provision.plant import parcels, sign_requests
 from teds_provision.plant.commands import parcels as commands_of_parcels
@@ -389,6 +390,66 @@ def test_a_copy_that_is_met_once_the_roster_has_expired_waits_for_a_person(plant
     sync(plant, "south", at=now(4))
     assert waits(plant["south"]) == ["the roster has expired"]
     assert not holds(plant["south"], board.uuid)
+
+
+def held_back(plant: Plant, at: datetime | None = None) -> str:
+    """What a sync of west reports about the parcels that it does not send; none leaves."""
+    done = parcels.send_out(plant["west"], plant.transport, plant.views("west"), at or now())
+    assert (done.count, plant.transport.there) == (0, {})
+    [why] = done.held_back
+    return why
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_a_copy_that_waits_is_not_sent_once_the_roster_has_expired(plant: Plant, by_hand: bool) -> None:
+    plant.roster(ROLES, *([] if by_hand else [everything(plant, "south")]), days=3)
+    board = board_of(plant["west"], os.urandom(10))
+    if by_hand:
+        order = outgoing.ExportOrder(("south",), (board.uuid,))
+        with plant["west"].lock("test"):
+            parcels.send_export(plant["west"], outgoing.plan_export(plant["west"], order), now())
+    else:
+        plant.transport.full = True
+        sync(plant, "west")
+        plant.transport.full = False
+    why = held_back(plant, now(4))
+    assert why.startswith("1 parcel held back: keys for south, as the roster expired on ")
+    assert why.endswith("registry renew")
+    plant.roster(ROLES, everything(plant, "south"))
+    sync(plant, "west", "south", at=now(4))
+    assert holds(plant["south"], board.uuid), "a new roster lets it go"
+
+
+def test_a_move_is_a_persons_act_whatever_the_date_of_the_roster(plant: Plant) -> None:
+    plant.roster(ROLES, days=3)
+    board = board_of(plant["west"], os.urandom(10))
+    order = outgoing.ExportOrder(("south",), (board.uuid,), "move")
+    with plant["west"].lock("test"):
+        parcels.send_export(plant["west"], outgoing.plan_export(plant["west"], order), now())
+    sync(plant, "west", at=now(4))
+    assert len(plant.transport.there) == 1
+
+
+def test_a_copy_that_waits_is_not_sent_once_nothing_shares_it(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board_of(plant["west"], os.urandom(10))
+    plant.transport.full = True
+    sync(plant, "west")
+    plant.transport.full = False
+    plant.roster(ROLES)
+    assert "no share of the roster" in held_back(plant)
+    plant.roster({**ROLES, "south": "line"}, everything(plant, "south"))
+    assert "no share of the roster" in held_back(plant)
+    plant.roster({"north": "keeper", "west": "line"}, removed={"south": (0, "")})
+    assert "south is no member any more" in held_back(plant)
+
+
+def test_a_copy_is_not_ordered_under_a_roster_that_has_expired(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    roster = plant.roster(ROLES, days=3)
+    monkeypatch.setattr("teds_provision.plant.jobs.now_of", lambda _: roster.expires)
+    with pytest.raises(RosterExpiredError, match="no copy of keys is sent"):
+        commands_of_parcels.ParcelCarrier("copy").require(plant["west"])
+    commands_of_parcels.ParcelCarrier("move").require(plant["west"])
 
 
 def test_a_removed_station_gets_nothing(plant: Plant) -> None:

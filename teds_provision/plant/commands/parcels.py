@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,26 @@ from teds_provision import plant
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.extending import add_examples, add_options, callback_of
 from teds_provision.cli.station.handover import import_plan, import_text, require_as_shown
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import RosterExpiredError, TedsProvisionError
 from teds_provision.handover.incoming import plan_import
 from teds_provision.handover.outgoing import ExportPlan
 from teds_provision.station.station import Station
 
 
+@dataclass(frozen=True)
 class ParcelCarrier:
-    """Sends bundles with the next sync of the registry."""
+    """Sends bundles of this mode with the next sync of the registry."""
+
+    mode: str
 
     def require(self, station: Station) -> None:
-        """Raise PolicyError if the station joined no registry."""
-        plant.apply_pages.require_roster(station)
+        """Raise PolicyError if the station joined no registry, RosterExpiredError if no sync would send a copy."""
+        roster = plant.apply_pages.require_roster(station)
+        if self.mode == "copy" and plant.jobs.now_of(roster) >= roster.expires:
+            raise RosterExpiredError(
+                f"The roster expired on {roster.expires:%Y-%m-%d}, so no copy of keys is sent.",
+                hint="Ask its owner to renew it: registry renew. Or hand over a file: --output FILE",
+            )
 
     def send(self, station: Station, plans: Sequence[ExportPlan]) -> tuple[dict[str, Any], str]:
         """Keep each bundle as a parcel that leaves with the next sync; the parcels' names."""
@@ -42,7 +51,7 @@ def extend_export(command: click.Command) -> None:
                 raise click.UsageError("Give one of --output FILE and --send.")
             if send and len(rest["receivers"]) != 1:
                 raise click.UsageError("A parcel is for one station: give --to once.")
-        core(carrier=ParcelCarrier() if send else None, **rest)
+        core(carrier=ParcelCarrier(rest["mode"]) if send else None, **rest)
 
     says = "Send it through the registry at the next sync, instead of a file."
     add_options(command, "--output", click.Option(["--send"], is_flag=True, help=says))
