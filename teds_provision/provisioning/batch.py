@@ -303,7 +303,8 @@ class BatchRun:
                 self.progress.ran_out("answered on the bus")
             return self.progress.totals()
         results = [board.result for board in self._boards]
-        steps = [{step.name: step.seconds for step in board.done.steps} for board in self._boards if board.done]
+        passed_boards = [board.done for board in self._boards if board.done is not None and board.result == "passed"]
+        steps = [{step.name: step.seconds for step in done.steps} for done in passed_boards]
         passed, seconds = results.count("passed"), round(time.monotonic() - self._began, 3)
         firsts: dict[bytes, bool] = {}  # of each board its first try; a "no" of the operator is none
         for board in self._boards:

@@ -12,7 +12,14 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflictError, NodeSilentError, NoNodeError, NotAuthenticError, PolicyError
+from teds_provision.errors import (
+    AddressConflictError,
+    NodeSilentError,
+    NoNodeError,
+    NotAuthenticError,
+    PolicyError,
+    UsageError,
+)
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning import batch
@@ -648,3 +655,53 @@ def test_a_plan_to_adopt_judges_what_a_board_brought_unless_it_has_a_datasheet(
     plan = run_of(station, order=BuildOrder(adopt=True))._plan_for(None)  # type: ignore[arg-type]
     assert plan.warnings == (("an error", "a warning") if brings else ("proposed",))
     assert plan.steps[-5:] == ("build", "sign", "write", "verify", "check")
+
+
+def test_the_mean_of_a_step_without_a_sheet_is_that_of_the_boards_that_passed_too(station: Station) -> None:
+    """A board that lacked the calibration of its type counted, and so did one that was not authentic."""
+    run = run_of(station, whole_bus=True)
+    good, bad = (Check("signed", result, "why") for result in ("passed", "failed"))  # type: ignore[arg-type]
+    boards = (
+        (good, None, 1.0),
+        (good, PolicyError("It has no calibration."), 9.0),
+        (bad, None, 9.0),
+        (good, None, 2.0),
+    )
+    for number, (check, error, seconds) in enumerate(boards):
+        steps = (SimpleNamespace(name="write", seconds=seconds),)
+        done: Any = SimpleNamespace(verified=Verification(uuid_of(number), (check,)), warnings=(), steps=steps)
+        run._note(BoardResult(uuid_of(number), 1.0, done, error))
+    totals = run.totals()
+    assert (totals.passed, totals.failed, totals.steps) == (2, 2, {"write": 1.5})
+    assert isinstance(totals.worst, NotAuthenticError), "the worst of all, its verdict counted"
+
+
+def test_a_bus_without_a_board_of_ours_ends_the_run_before_anything(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = Bus(answer(1), answer(2))
+    monkeypatch.setattr(batch, "open_port", lambda _links: bus)
+    run = run_of(station, whole_bus=True)
+    with pytest.raises(PolicyError, match=r"^2 nodes answered, but none is on the whitelist"):
+        list(run._all_at_once(Operator()))
+    assert (bus.closed, run._all_done) == (1, False)
+    bus.capabilities = SimpleNamespace(many=False, max_parallel=1)  # type: ignore[assignment]
+    with pytest.raises(UsageError, match="--all needs a bus: a reader sees one node at a time"):
+        list(run._all_at_once(Operator()))
+    assert bus.closed == 2
+
+
+def test_a_board_of_the_bus_that_lacks_the_calibration_of_its_type_has_that_error(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_of(station, whole_bus=True)
+    done = SimpleNamespace(image=Image(uuid_of(1), {}))
+    monkeypatch.setattr(run, "_was_finished_elsewhere", lambda _node: False)
+    monkeypatch.setattr(run, "_provision", lambda *_: done)
+    ended = run._board(answer(1), "can:test", Operator())
+    assert ended is not None
+    assert (ended.done, ended.place) == (done, "can:test")
+    assert isinstance(ended.error, PolicyError)
+    assert "has no calibration of channel 1, which its type requires." in ended.error.message
+    monkeypatch.setattr(run, "_was_finished_elsewhere", lambda _node: True)
+    assert run._board(answer(1), "can:test", Operator()) is None

@@ -415,3 +415,80 @@ def test_a_reader_that_is_missing_is_named_with_where_the_node_was_last(
     )
     assert error(LinkSettings(nfc="usb")).message == "No reader is plugged in."
     assert error(LinkSettings(via_chosen=True)).message == "No reader is plugged in."
+
+
+# -- at one link -------------------------------------------------------------------------------------------------------
+
+
+class OnePort:
+    """A port at which these nodes are, and what was asked of it in which order."""
+
+    def __init__(self, *contacts: Contact) -> None:
+        self.contacts, self.calls = list(contacts), list[Any]()
+
+    def find(self, wanted: Callable[[Identity], bool], **asked: Any) -> Contact:
+        self.calls.append(asked)
+        found = [contact for contact in self.contacts if wanted(contact.identity)]
+        if not found:
+            raise NoNodeError("nobody")
+        return found[0]
+
+    def find_all(self, **asked: Any) -> list[Contact]:
+        self.calls.append(asked)
+        return self.contacts
+
+    def close(self) -> None:
+        self.calls.append("closed")
+
+
+def opened(monkeypatch: pytest.MonkeyPatch, *contacts: Contact) -> OnePort:
+    port = OnePort(*contacts)
+    monkeypatch.setattr(meeting, "open_port", lambda _links: port.calls.append("opened") or port)
+    monkeypatch.setattr(meeting, "avoid_measuring_source", lambda *asked: port.calls.append(asked[2]))
+    return port
+
+
+def test_one_node_is_met_on_the_chosen_link_at_its_last_address_and_left_whole(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, meant = contact(bytes(10), 0x22), contact()
+    port = opened(monkeypatch, other, meant)
+    station.nodes.remember(UUID, can_address=0x21)
+    links, reporter = LinkSettings(via="can", can="a:1", timeout=7.0, via_chosen=True), SilentReporter()
+    with meet(station, links, UUID, reporter, before=lambda: port.calls.append("asked")) as node:
+        assert node.contact is meant
+        assert port.calls == [
+            "opened", UUID, "asked", {"seconds": 7.0, "notice": reporter.notice, "address": 0x21},
+        ]  # fmt: skip
+    assert port.calls[-1] == "closed"
+    assert meant.link.closed == 1  # type: ignore[attr-defined]
+    with meeting._met_at(station, links, UUID, reporter, print, quietly=True):
+        assert port.calls[-1]["notice"] != reporter.notice, "a look aside says nothing"
+    port.contacts = [other]
+    with pytest.raises(NoNodeError), meet(station, links, UUID, reporter):
+        pass
+    assert port.calls[-1] == "closed"
+
+
+def test_any_node_is_the_only_one_that_is_not_finished(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(station.datasheets), "reads_well", lambda *_: True)
+    done, new = contact(bytes(10), 0x22, NodeState.PROVISIONED), contact()
+    port = opened(monkeypatch, done, new)
+    links, reporter = LinkSettings(via="can", can="a:1", timeout=7.0), SilentReporter()
+    with meet(station, links, None, reporter, before=lambda: port.calls.append("asked")) as node:
+        assert node.contact is new
+    assert port.calls == ["opened", "asked", {"seconds": 7.0, "notice": reporter.notice}, "closed"]
+    port.contacts = [new, contact(bytes(9) + b"\1", 0x23, NodeState.KEYED)]
+    with pytest.raises(UsageError), meet(station, links, None, reporter):
+        pass
+    assert port.calls[-1] == "closed"
+
+
+def test_all_nodes_are_met_but_those_that_cannot_be_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, twin, other = contact(address=0x21), contact(address=0x22), contact(bytes(10), 0x23)
+    port = opened(monkeypatch, one, twin, other)
+    links, reporter = LinkSettings(via="can", can="a:1", timeout=7.0, listen=2.0), SilentReporter()
+    with meeting.meet_all(links, reporter) as nodes:
+        assert [node.contact for node in nodes] == [other]
+    assert port.calls == ["opened", {"seconds": 7.0, "notice": reporter.notice, "listen": 2.0}, "closed"]
+    assert [found.link.closed for found in (one, twin, other)] == [0, 0, 1]  # type: ignore[attr-defined]
