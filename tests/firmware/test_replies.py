@@ -77,22 +77,39 @@ def test_about_is_answered_anew_each_time(stations: Stations) -> None:
     stations.node.close()
 
 
-def test_list_is_answered_anew_each_time() -> None:
+@pytest.mark.parametrize(
+    "question",
+    ["000080070000", "0000800b0000", "000101010001 0c", "000101020005 0c00000000"],
+    ids=["Identify", "List", "Query", "Read"],
+)
+def test_a_question_is_answered_anew_each_time(question: str) -> None:
     desk = CDesk()
     confirm(desk)
 
-    def name_all() -> str:
-        asked = bytes.fromhex("07 0500 0080 0b0000")
-        desk.node.take_frame(physical_id(desk.node.can_address, 0xF5), asked, fd=True)
+    def ask() -> str:
+        body = b"\x05" + bytes.fromhex(question)
+        desk.node.take_frame(physical_id(desk.node.can_address, 0xF5), single(body, fd=True), fd=True)
         desk.node.poll()
         sent = desk.node.next_frame()
         assert sent is not None
         return sent[1].hex()
 
-    assert name_all() == name_all() == "0705010003000080"
+    before = ask()
+    assert ask() == before
     assert commit(desk).ok
-    assert name_all().startswith("000d0501000900000100008000010c")
+    assert ask() != before
     CDesk.close_all()
+
+
+def test_a_proof_is_made_anew_each_time(stations: Stations) -> None:
+    prove = b"\x05" + bytes.fromhex("000080080020") + bytes(32)
+    work = []
+    for _ in range(2):
+        stations.node.chip_fails(0)
+        assert stations.ask(0xF1, prove)
+        work.append(stations.node.chip_calls)
+    assert work == [1, 1], "a signature each time"
+    stations.node.close()
 
 
 def test_the_oldest_reply_gives_way(stations: Stations) -> None:

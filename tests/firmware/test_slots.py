@@ -89,6 +89,7 @@ def test_flash_is_left_alone_where_nothing_is_to_be_erased(desk: CDesk) -> None:
     """After the very first start, and once the old slot is blank."""
     desk.node.image = bytes([0xFF]) * len(desk.node.image)
     desk.restart()
+    assert desk.node.can_address == 192, "1 + CRC-32(UUID) mod 239"
     for _ in range(2):
         desk.node.cut(0, torn=False)
         desk.node.poll()
@@ -139,9 +140,14 @@ def test_a_torn_slot_of_any_form_is_erased_and_a_torn_identity_of_any_form_stops
     desk.node.image = wrong = image[:4] + b"\2" + image[5:]
     assert desk.node.start() == TORN_IDENTITY
     assert desk.node.image == wrong
+    blank = b"\xff" * ((len(image) - IDENTITY) // 2)
+    slot = image[at : at + len(blank)]
+    for slots in (slot + blank, blank + slot):
+        desk.node.image = wrong[:IDENTITY] + slots
+        assert desk.node.start() == TORN_IDENTITY, "it was shown, so it is never made again"
 
 
-@pytest.mark.parametrize("total", [195, 8193, 1 << 31])
+@pytest.mark.parametrize("total", [0, 3, 31, 195, 8193, 1 << 31])
 def test_a_slot_whose_length_cannot_be_is_torn(desk: CDesk, total: int) -> None:
     provisioned(desk)
     desk.node.poll()
@@ -160,9 +166,9 @@ def test_records_that_would_be_longer_than_their_slot_are_torn_under_a_good_crc(
     image = desk.node.image
     at, spare = in_use(image)
     octets = int.from_bytes(image[at + 12 : at + 16], "big")
-    for records, good in ((octets - 196, True), (octets - 195, False)):
-        body = image[at : at + 8] + b"\x7f" * 4 + image[at + 12 : at + 16] + records.to_bytes(4, "big")
-        body += image[at + 20 : at + octets - 4]
+    for length, records, good in ((octets, octets - 196, True), (octets, octets - 195, False), (188, 0, False)):
+        body = image[at : at + 8] + b"\x7f" * 4 + length.to_bytes(4, "big") + records.to_bytes(4, "big")
+        body += image[at + 20 : at + length - 4]
         slot = body + zlib.crc32(body).to_bytes(4, "big")
         desk.node.image = image[:spare] + slot + image[spare + octets :]
         desk.restart()

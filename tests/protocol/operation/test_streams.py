@@ -184,6 +184,8 @@ def test_the_messages_of_a_long_sleep_are_counted_as_missed() -> None:
     bench.until(760 * MS)
     consumer.messages()
     assert consumer.receiver.counts.lost == bench.tim.missed > 10
+    assert bench.send(stop(0)).ok
+    assert consumer.receiver.counts.lost == bench.tim.missed, "since the start, whatever ended"
 
 
 def test_a_node_that_slept_past_the_last_counter_sends_it_and_ends_the_stream() -> None:
