@@ -13,7 +13,13 @@ from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.files import SHARED, read_text, write_whole
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
-from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
+from teds_provision.measure.sample_series import (
+    SampleSeries,
+    reference_for,
+    require_still,
+    require_still_raw,
+    take_samples_of,
+)
 from teds_provision.measure.sources import own_source_address
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.provisioning.conversation import SessionLostError
@@ -94,4 +100,6 @@ def _point(settled: SampleSeries, reference: float) -> Point:
         )
     if channel.calibration is not None and not settled.interpreter.problem:
         require_still(settled)
+    else:
+        require_still_raw(settled, reading)
     return Point(channel.number, reading.mean, reference, reading.spread, reading.count)

@@ -107,6 +107,20 @@ def require_still(settled: SampleSeries) -> SampleStatistics:
     )
 
 
+def require_still_raw(settled: SampleSeries, reading: SampleStatistics) -> None:
+    """Raise PolicyError if raw values spread, or drift, by more than a hundredth of those that the channel can give."""
+    ends = settled.interpreter.reader.form.raw_range
+    if ends is None or not reading.is_unstable(_UNSTATED * (ends[1] - ends[0])):
+        return
+    moves = abs(reading.drift) > reading.spread
+    raise PolicyError(
+        f"Channel {settled.interpreter.channel.number} is not steady: its raw value "
+        f"{'drifts' if moves else 'spreads'} by {abs(reading.drift) if moves else reading.spread:.6g}; "
+        f"{_UNSTATED * (ends[1] - ends[0]):.6g} is allowed.",
+        hint="Keep it still and try again.",
+    )
+
+
 def reference_for(channel: Channel, value: float | None, unit: str | None, *, shown_unit_asked: bool) -> float:
     """Return an operator's reference value of a channel in SI units; None is 0 in the display unit.
 

@@ -65,6 +65,7 @@ _TERM: Final = re.compile(
     r"\s*([-+]?(?:[0-9]{1,20}(?:\.[0-9]{0,20})?|\.[0-9]{1,20})(?:[eE][-+]?[0-9]{1,3})?)\s*([^\s0-9.].*)?\Z"
 )
 _HERTZ: Final = NAMED["1/s"]
+_UNITLESS: Final = "1"
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,10 @@ def _fit_of(requirement: Requirement, channel: Channel, now: datetime | None) ->
         short.append(channel.value_problem)
     for term in requirement.terms:
         has = _has(term, channel)
-        if math.isnan(has):
+        if not _is_in_its_unit(term, channel):
+            unit = channel.shown.text or "plain numbers"
+            short.append(f"{term.what} is in {unit}, asked is {term.operator} {_asked(term)}")
+        elif math.isnan(has):
             unknown.append(f"{term.what} is not stated")
         elif not _meets(term, has, channel):
             short.append(f"{term.what} is {_shown(term, has, channel)}, asked is {term.operator} {_asked(term)}")
@@ -207,6 +211,13 @@ def _has(term: Term, channel: Channel) -> float:
             return channel.high if term.upward else channel.low
 
 
+def _is_in_its_unit(term: Term, channel: Channel) -> bool:
+    """Return True if a bound is in a unit of the channel's kind; a number without a unit is in SI."""
+    if term.what == "rate" or _relative(term) or term.unit.text == _UNITLESS:
+        return True
+    return term.unit.units == channel.units
+
+
 def _meets(term: Term, has: float, channel: Channel) -> bool:
     if term.what in QUANTITIES and term.upward and _every_angle(channel):
         return True
@@ -239,7 +250,7 @@ def _shown(term: Term, has: float, channel: Channel) -> str:
 
 
 def _asked(term: Term) -> str:
-    return f"{term.value:g} {term.unit.text}".strip()
+    return f"{term.value:g} {'' if term.unit.text == _UNITLESS else term.unit.text}".strip()
 
 
 def _relative(term: Term) -> bool:
@@ -265,7 +276,7 @@ def _term(text: str) -> Term:
         raise BadDataError(f'"{match[3]}" in "{text.strip()[:60]}" is not a number.') from error
     if not math.isfinite(value):
         raise BadDataError(f'"{match[3]}" in "{text.strip()[:60]}" is too large.')
-    unit = parse_unit((match[4] or "1").strip())
+    unit = parse_unit((match[4] or _UNITLESS).strip())
     return Term(name, match[2], value, unit)
 
 
@@ -284,7 +295,7 @@ def _with_fitting_units(requirement: Requirement) -> Requirement:
         if not fits:
             asked = "1/s" if term.what == "rate" else format_units(QUANTITIES[requirement.quantity])
             raise BadDataError(
-                f'"{term.text}": the unit {term.unit.text or "1"} does not measure this.',
+                f'"{term.text}": the unit {term.unit.text or _UNITLESS} does not measure this.',
                 hint=f"Write it in {asked}, or in another unit of the same kind.",
             )
     return requirement

@@ -53,14 +53,21 @@ class Signer:
 
 
 def _made(
-    name: str, issuer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None, days: tuple[int, int], *, ca: bool
+    name: str,
+    issuer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None,
+    days: tuple[int, int],
+    *,
+    ca: bool,
+    use: str = "sign",
 ) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = datetime.now(UTC)
     above, by = issuer if issuer is not None else (None, key)
-    usage = x509.KeyUsage(not ca, False, False, False, False, ca, ca, False, False)
-    certificate = (
+    usage = x509.KeyUsage(
+        not ca and use == "sign", use == "commit", False, use == "encipher", False, ca, ca, False, False
+    )
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(above.subject if above is not None else subject)
@@ -69,13 +76,12 @@ def _made(
         .not_valid_before(now + timedelta(days=days[0]))
         .not_valid_after(now + timedelta(days=days[1]))
         .add_extension(x509.BasicConstraints(ca, None), critical=True)
-        .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(by.public_key()), critical=False)
         .add_extension(x509.SubjectAlternativeName([x509.DNSName("lab.example")]), critical=False)
-        .sign(by, hashes.SHA256())
     )
-    return certificate, key
+    builder = builder.add_extension(usage, critical=True) if use else builder
+    return builder.sign(by, hashes.SHA256()), key
 
 
 def _pem(certificate: x509.Certificate) -> bytes:
@@ -90,10 +96,10 @@ def signer(name: str = "Thermolab Example", days: tuple[int, int] = (-1, 300)) -
 
 
 @cache
-def signer_under_ca() -> tuple[Signer, bytes]:
-    """Return a laboratory, and the PEM of the CA above it."""
+def signer_under_ca(use: str = "sign") -> tuple[Signer, bytes]:
+    """Return a laboratory whose key is for one use ("" if it states none), and the PEM of the CA above it."""
     ca = _made("Accreditation Example", None, (-30, 3000), ca=True)
-    certificate, key = _made("Lab under a CA", ca, (-1, 300), ca=False)
+    certificate, key = _made("Lab under a CA", ca, (-1, 300), ca=False, use=use)
     return Signer(_key(key), _pem(certificate)), _pem(ca[0])
 
 

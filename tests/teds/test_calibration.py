@@ -25,6 +25,7 @@ from teds_provision.teds.calibration import (
     evaluate,
     fit,
     from_decoded,
+    left_out,
     load_calibrations,
     read_calibrations,
     residuals,
@@ -568,3 +569,79 @@ def test_a_column_that_is_named_twice_is_refused(tactile: Profile) -> None:
     text = "channel;from;to;from;to;offset;c0;c1\n1;0;512;0;0,5;0,001\n"
     with pytest.raises(BadDataError, match=r'c\.csv:1: the column "from" appears twice'):
         read_calibrations(text, "c.csv", tactile)
+
+
+POLYGON = [(0.0, 0.0), (1.0, 1.0), (2.0, 2.0), (3.0, 1.5), (4.0, 1.0), (6.0, 0.0), (8.0, 4.25), (10.0, 8.0)]
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "nodes"),
+    [
+        (0.0, [0, 1, 2, 3, 4, 6, 8, 10]),
+        (0.2, [0, 2, 6, 8, 10]),
+        (0.25, [0, 2, 6, 10]),
+        (1.9, [0, 2, 6, 10]),
+        (2.0, [0, 6, 10]),
+        (9.0, [0, 10]),
+    ],
+)
+def test_every_point_stays_within_the_tolerance_of_the_nodes_that_are_kept(tolerance: float, nodes: list[int]) -> None:
+    """At most so far: the point at 8 is 0.25 above the line between its neighbours."""
+    table = fit(POLYGON, "table", channel=1, tolerance=tolerance)
+    assert table.inputs[0].boundaries == tuple(nodes)
+    for raw, value in POLYGON:
+        assert abs(evaluate(table, raw).value - value) <= tolerance + 1e-6
+
+
+def test_of_two_points_none_is_left_out() -> None:
+    assert fit(POLYGON[:2], "table", channel=1, tolerance=9.0).inputs[0].boundaries == (0.0, 1.0)
+    assert fit(POLYGON[:3], "table", channel=1, tolerance=0.1).inputs[0].boundaries == (0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("degree", "points", "why"),
+    [
+        (1, 2, ""),
+        (2, 3, ""),
+        (12, 13, ""),
+        (2, 2, "A polynomial of degree 2 needs 3 different inputs; there are 2."),
+        (12, 12, "A polynomial of degree 12 needs 13 different inputs; there are 12."),
+        (0, 9, "The degree of a polynomial goes from 1 to 12, not 0."),
+        (13, 20, "The degree of a polynomial goes from 1 to 12, not 13."),
+    ],
+)
+def test_a_polynomial_has_a_degree_from_1_to_12_and_one_point_more(degree: int, points: int, why: str) -> None:
+    rows = [(float(x), float(x % 3)) for x in range(points)] + [(0.0, 0.0)]  # one input twice
+    if not why:
+        assert fit(rows, "polynomial", channel=1, degree=degree).inputs[0].degree == degree
+        return
+    with pytest.raises(BadDataError) as refused:
+        fit(rows, "polynomial", channel=1, degree=degree)
+    assert refused.value.message == why
+
+
+def test_points_are_left_out_of_a_polynomial_of_the_same_degree() -> None:
+    """A parabola through y = x³ without the point at 2, and a line through it: by hand."""
+    cubes = [(float(x), float(x**3)) for x in range(5)]
+    line = fit(cubes, "polynomial", channel=1, degree=1)
+    others = [pair for pair in cubes if pair[0] != 2]
+    mean = sum(y for _, y in others) / 4
+    assert left_out(line)[1] == pytest.approx(8 - mean, rel=1e-5), "the mean of the others lies at x = 2"
+    assert left_out(fit(cubes, "polynomial", channel=1, degree=3)) == pytest.approx((0, 0, 0), abs=1e-4)
+
+
+def test_a_sentence_on_an_actuators_fit_is_in_raw_values_at_what_is_set() -> None:
+    points = [(0.0, 0.0), (100.0, 1.0), (204.0, 2.0)]
+    mm = replace(fit(points, "linear", channel=2, actuator=True), unit=parse_unit("mm"))
+    assert sentence(mm) == "channel 2: linear, 3 points, largest residual 1.33 raw at 1 mm, rms 0.943 raw"
+    sensor = replace(fit(points, "linear", channel=2), unit=parse_unit("mm"))
+    assert sentence(sensor).startswith("channel 2: linear, 3 points, largest residual 0.0131 mm at raw 100")
+
+
+def test_outside_is_beyond_either_end_of_any_input_and_what_is_no_number() -> None:
+    parts = (CalibrationInput(1, 1, (0.0, 4.0, 10.0), (0.0, 0.0)), CalibrationInput(2, 1, (5.0, 6.0), (0.0,)))
+    both = Calibration(1, "polynomial", parts, (0.0,) * 8)
+    for one, other, outside in (
+        (0, 5, 0), (10, 6, 0), (-0.1, 5, 1), (10.1, 5, 1), (5, 4.9, 1), (5, 6.1, 1), (math.nan, 5, 1), (5, math.nan, 1),
+    ):  # fmt: skip
+        assert evaluate(both, one, other).outside == outside, (one, other)

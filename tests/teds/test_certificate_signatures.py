@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -124,3 +125,60 @@ def test_two_signatures_or_too_many_references_are_refused_if_one_is_required() 
 def test_a_file_that_holds_no_certificate_is_named_as_such() -> None:
     with pytest.raises(BadDataError, match="no certificate in PEM"):
         read(ANGLE, b"-----BEGIN NOTHING-----")
+
+
+@pytest.mark.parametrize(("use", "good"), [("sign", True), ("commit", True), ("", True), ("encipher", False)])
+def test_a_key_below_a_trusted_ca_is_one_for_signatures(use: str, good: bool) -> None:
+    lab, ca = signer_under_ca(use)
+    signed = lab.sign(ANGLE)
+    if good:
+        assert read(signed, ca).signature == "good"
+    else:
+        with pytest.raises(NotAuthenticError, match="which is not trusted"):
+            read(signed, ca)
+
+
+def _reordered(octets: bytes) -> bytes:
+    """Return a signed certificate whose signature brings its certificates the other way round."""
+    root = etree.fromstring(octets)
+    (holder,) = root.iter(f"{DS}X509Data")
+    certificates = holder.findall(f"{DS}X509Certificate")
+    assert len(certificates) == 2
+    for certificate in reversed(certificates):
+        holder.remove(certificate)
+        holder.append(certificate)
+    return etree.tostring(root)
+
+
+def test_a_trusted_certificate_that_is_only_brought_along_makes_no_signer_trusted() -> None:
+    lab, thief = signer(), signer("Another laboratory")
+    forged = replace(thief, chain=(lab.certificate,)).sign(ANGLE, xades=False)
+    for octets in (forged, _reordered(forged)):
+        with pytest.raises(NotAuthenticError):
+            read(octets, lab.certificate)
+
+
+def test_the_signers_certificate_is_found_wherever_it_stands_and_so_is_a_trusted_one() -> None:
+    lab, ca = signer_under_ca()
+    signed = replace(lab, chain=(ca,)).sign(ANGLE, xades=False)
+    for octets in (signed, _reordered(signed)):
+        assert read(octets, ca).signature == "good"
+        assert read(octets, lab.certificate).signature == "good"
+    other = signer("Another laboratory").certificate
+    assert read(signed, other + lab.certificate).signature == "good", "the second of a file"
+
+
+def test_a_signers_certificate_that_is_not_valid_yet_is_refused() -> None:
+    """By our clock: a time of signing that is later than now proves nothing."""
+    lab = signer()
+    with pytest.raises(NotAuthenticError, match="not valid any more, or not yet"):
+        read(lab.sign(ANGLE), lab.certificate, later=-400)
+    below, ca = signer_under_ca()
+    with pytest.raises(NotAuthenticError, match="which is not trusted"):
+        read(below.sign(ANGLE), ca, later=-20)
+
+
+def test_a_signature_by_someone_unknown_states_what_was_not_checked_either() -> None:
+    unknown = read(signer().sign(ANGLE)).unchecked
+    assert unknown[0] == "The signer is not known: name the certificate with --trust-dcc."
+    assert "revocation" in unknown[1]

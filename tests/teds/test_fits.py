@@ -68,6 +68,33 @@ def test_each_bound_is_judged_in_its_unit(text: str, result: str, words: str) ->
     assert (found.result, words in found.why) == (result, True), found.why
 
 
+@pytest.mark.parametrize(
+    ("text", "result", "why"),
+    [
+        ("range >= 5 N", "failed", "range is in °, asked is >= 5 N."),
+        ("high >= 6 degC", "failed", "high is in °, asked is >= 6 degC."),
+        ("low <= 1 kg", "failed", "low is in °, asked is <= 1 kg."),
+        ("uncertainty <= 1 V", "failed", "uncertainty is in °, asked is <= 1 V."),
+        ("range >= 5 count", "failed", "range is in °, asked is >= 5 count."),
+        ("range >= 50 %", "failed", "range is in °, asked is >= 50 %."),
+        ("range >= 5 rad, high <= 7 N", "failed", "high is in °, asked is <= 7 N."),
+        ("uncertainty <= 1 %, rate >= 1 Hz", "passed", "uncertainty 0.278 %, rate 10000 Hz."),
+        ("range >= 6.28", "passed", "range 360 °."),
+        ("range >= 6.29", "failed", "range is 360 °, asked is >= 6.29."),
+    ],
+)
+def test_a_bound_in_a_unit_of_another_kind_is_not_met(text: str, result: str, why: str) -> None:
+    """5 N were compared with 6.28 rad, and an angle sensor passed. A number without a unit is in SI."""
+    found = only(text, angle())
+    assert (found.result, found.why) == (result, why)
+
+
+def test_a_named_channel_of_another_kind_does_not_meet_its_bound() -> None:
+    (required,) = parse_require('["the shaft"]\nrange = ">= 5 N"\n', "r")
+    (found,) = judge(required, angle(name="the shaft"))
+    assert (found.result, met(required, (found,))) == ("failed", False)
+
+
 def test_a_part_of_a_turn_reaches_no_further_than_its_limits() -> None:
     half = angle(low=-math.pi / 2, high=math.pi / 2)
     assert only("angle >= 90 deg", half).result == "passed"

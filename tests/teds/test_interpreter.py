@@ -522,3 +522,42 @@ def test_what_is_not_described_is_refused() -> None:
         ChannelInterpreter(ANGLE, 9)
     with pytest.raises(BadDataError, match="how a sample"):
         ChannelInterpreter(changed(ANGLE, sample=None), 1)
+
+
+@pytest.mark.parametrize(
+    ("profile", "low", "high"), [("load-cell", -500.0, 500.0), ("temperature-sensor", -40.0, 125.0)]
+)
+def test_values_far_beyond_a_turn_find_their_way_back_where_nothing_wraps(
+    profile: str, low: float, high: float
+) -> None:
+    ends = SampleReader(sheet_of(profile).channels[0].sample or SampleForm(0, 2)).form.raw_range
+    assert ends is not None
+    line = fit([(ends[0], low), (ends[1], high)], "linear", channel=1)
+    interpreter = ChannelInterpreter(sheet_of(profile, {1: replace(line, unit=sheet_of(profile).channels[0].unit)}), 1)
+    values = np.linspace(*interpreter.limits, 9)[1:-1]
+    step = (high - low) / (ends[1] - ends[0])
+    assert interpreter.decode(interpreter.encode(values)).value.tolist() == pytest.approx(values.tolist(), abs=step)
+    assert interpreter.given == (pytest.approx(low), pytest.approx(high))
+
+
+def test_a_refused_set_point_is_stated_in_the_unit_that_was_written() -> None:
+    interpreter = ChannelInterpreter(actuator(), 1)
+    assert interpreter.beyond(interpreter.limits[1]) == interpreter.beyond(interpreter.limits[0]) == ""
+    too_far = interpreter.unit.from_si(0.2)
+    assert interpreter.beyond(too_far, parse_unit("cm")) == (
+        "20 cm exceeds the limits of channel 1 (opening set point), 0 to 11 cm."
+    )
+    assert interpreter.beyond(too_far).startswith("0.2 m exceeds the limits of channel 1")
+
+
+def test_what_a_compensated_channel_needs_is_named_on_the_way_back() -> None:
+    gain = 10 / 65535
+    parts = (CalibrationInput(1, 1, (0, 65535), (0,)), CalibrationInput(2, 1, (0, 65535), (0,)))
+    both = Calibration(1, "polynomial", parts, (0.0, 0.0, gain, 0.0), unit=parse_unit("N"))
+    interpreter = ChannelInterpreter(sheet_of("tactile-finger-sensor", {1: both}), 1)
+    assert interpreter.given is None
+    for others in (None, {}):
+        with pytest.raises(BadDataError, match=r"^Channel 1 is compensated by channel 2, which is not given\.$"):
+            interpreter.encode(5.0, others)
+    other = {2: np.array([7], dtype=np.uint64)}
+    assert int.from_bytes(interpreter.encode(5.0, other), "big") == pytest.approx(32768, abs=1)

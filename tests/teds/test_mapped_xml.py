@@ -37,6 +37,68 @@ def test_the_examples_become_types_with_limits_in_their_units(
         assert ends == pytest.approx(channels[channel.number][2:], rel=1e-6)
 
 
+WHOLE = b"""<lab:sheet xmlns:lab="urn:lab"><head><title>  Two
+  <b>ways</b></title><serial>007</serial></head>
+ <out no="4" kind="F"><range unit="newton"><low>-1.50</low><high>+2e1</high></range></out>
+ <out kind="T"><range unit="C"><low>0</low><high>9</high></range></out></lab:sheet>"""
+WHOLE_MAP = """
+channel = "out"
+[keys]
+description = "head/title"
+name = "head/serial"
+[values]
+title = "Mine"
+name = "overlaid"
+links = ["nfc", "can"]
+abstract = false
+[channel-keys]
+name = { at = "@kind", words = { F = "force", T = "temperature" } }
+unit = { at = "range/@unit", words = { newton = "N", C = "degC" } }
+low-limit = { at = "range/low", unit-at = "range/@unit", words = { newton = "N", C = "degC" } }
+high-limit = { at = "range/high", unit = "kN" }
+type = "range/high"
+[channel-values]
+type = "overlaid"
+sample = { model = "unsigned", octets = 2 }
+"""
+
+
+def test_the_text_that_is_made_whole() -> None:
+    """Places go before values; a channel without a number gets its place in the file; white space is one space."""
+    mapping = WHOLE_MAP.replace("[channel-keys]", "[channel-keys]\nnumber = '@no'", 1)
+    xml = WHOLE.replace(b'<out kind="T">', b'<out no="05" kind="T">')
+    text = profile_from_xml(xml, mapping, name="lab", file="/home/me/two.xml")
+    assert (
+        text
+        == """# Made from two.xml.
+title = "Mine"
+name = 7
+links = ["nfc", "can"]
+abstract = false
+description = "Two ways"
+
+[channel.4]
+type = 20.0
+sample = { model = "unsigned", octets = 2 }
+name = "force"
+unit = "N"
+low-limit = "-1.50 N"
+high-limit = "+2e1 kN"
+
+[channel.5]
+type = 9
+sample = { model = "unsigned", octets = 2 }
+name = "temperature"
+unit = "degC"
+low-limit = "0 degC"
+high-limit = "9 kN"
+"""
+    )
+    numbered = profile_from_xml(WHOLE, WHOLE_MAP, name="lab", file="two.xml")
+    assert [line for line in numbered.splitlines() if line.startswith("[")] == ["[channel.1]", "[channel.2]"]
+    assert 'title = "lab"' in profile_from_xml(WHOLE, 'channel = "out"', name="lab")
+
+
 @pytest.mark.parametrize(
     ("xml", "mapping", "words"),
     [

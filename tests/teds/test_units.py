@@ -254,3 +254,82 @@ def test_everyday_units_do_not_load_pint() -> None:
     code = "import sys; from teds_provision.teds.units import parse_unit as p\n"
     code += "p('degree'), p('N'); print('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    ("texts", "interpretation", "bases", "scale", "offset"),
+    [
+        ("1 count counts LSB", 0, "", 1.0, 0.0),
+        ("digital bit bits boolean state", 4, "", 1.0, 0.0),
+        ("arbitrary a.u. arb", 5, "", 1.0, 0.0),
+        ("% percent", 1, "", 0.01, 0.0),
+        ("ratio", 1, "", 1.0, 0.0),
+        ("ppm", 1, "", 1e-6, 0.0),
+        ("strain m/m mm/mm", 1, "meters", 1.0, 0.0),
+        ("microstrain ustrain µε um/m µm/m", 1, "meters", 1e-6, 0.0),
+        ("dB decibel", 3, "", 0.1, 0.0),
+    ],
+)
+def test_what_is_no_product_of_si_units(
+    texts: str, interpretation: int, bases: str, scale: float, offset: float
+) -> None:
+    for text in texts.split():
+        unit = u.parse_unit(text)
+        assert unit.units == Units(interpretation, **dict.fromkeys(bases.split(), Fraction(1))), text  # type: ignore[arg-type]
+        assert (unit.scale, unit.offset) == (pytest.approx(scale), offset), text
+    volts = {"meters": 2, "kilograms": 1, "seconds": -3, "amperes": -1}
+    assert u.parse_unit("mV/V").units == Units(1, **{base: Fraction(n) for base, n in volts.items()})
+    assert (u.parse_unit("mV/V").scale, u.parse_unit("dBm").to_si(0.0)) == (pytest.approx(1e-3), -3.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "seconds"),
+    [
+        ("d day days", 86_400),
+        ("week weeks", 604_800),
+        ("month months", 2_629_746),
+        ("year years", 31_556_952),
+        ("h hour hours", 3600),
+        ("min minute minutes", 60),
+        ("s second seconds", 1),
+        ("ms", 1e-3),
+        ("us µs", 1e-6),
+        ("ns", 1e-9),
+    ],
+)
+def test_every_name_of_a_time(names: str, seconds: float) -> None:
+    """A year has 365.2425 days, a month a twelfth of them."""
+    for name in names.split():
+        assert u.parse_seconds(f"3 {name}") == pytest.approx(3 * seconds), name
+
+
+def test_exponents_of_a_teds_are_halves_from_64_below_to_63_and_a_half_above() -> None:
+    for text, exponent in (("m**63.5", Fraction(127, 2)), ("m**-64", Fraction(-64)), ("m^0.5", Fraction(1, 2))):
+        assert exponents(text) == {"meters": exponent}
+    for text in ("m**64", "m**-64.5", "m**63.5*m"):
+        with pytest.raises(BadDataError, match=r"a TEDS can say halves from -64 to 63\.5"):
+            u.parse_unit(text)
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "name"),
+    [
+        (1.0, 0.0, "K"),
+        (1.0, 273.15, "°C"),
+        (5 / 9, 459.67 * 5 / 9, "°F"),
+        (2.0, 0.0, "(× 2 K)"),
+        (2.0, 1.5, "(× 2 K + 1.5)"),
+        (1.0 + 1e-7, 273.15, "°C"),
+        (1.0 + 1e-5, 273.15, "(× 1.00001 K + 273.15)"),
+    ],
+)
+def test_a_conversion_has_its_usual_name_or_is_called_after_its_scale(scale: float, offset: float, name: str) -> None:
+    assert u.recognize(u.parse_units("K"), scale, offset).text == name
+
+
+def test_a_difference_is_shown_without_an_offset_and_keeps_its_sign() -> None:
+    kelvin = u.display_unit(u.parse_units("K"))
+    assert [u.format_value(value, kelvin, difference=True) for value in (2.0, -2.0)] == ["2 °C", "-2 °C"]
+    falling = u.WrittenUnit("x", u.parse_units("K"), -2.0, 5.0)
+    assert [u.format_value(value, falling, difference=True) for value in (2.0, -2.0)] == ["1 x", "-1 x"]
+    assert u.format_value(123.456789, falling, digits=3) == "-59.2 x"
