@@ -27,7 +27,8 @@ from teds_provision.protocol.handover.bundle import Bundle, BundledNode
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import Handover, HandoverMode, Holder, Tombstone, TrustRecord
+from teds_provision.station.store.records import Draft, Handover, HandoverMode, Holder, Tombstone, TrustRecord
+from teds_provision.teds.image import Image
 
 SOUTH, WEST, STRANGER = SoftwareKey(111), SoftwareKey(112), SoftwareKey(113)
 TO_SOUTH, TO_WEST = fingerprint(SOUTH.point), fingerprint(WEST.point)
@@ -130,7 +131,10 @@ def test_a_bundle_that_left_is_found_by_four_digits_of_its_id(station: Station) 
     station.handovers.put(replace(row, id=OTHER_ID))
     came = replace(row, id="aaaa1111-2222-4333-8444-555555555555", direction="in")
     station.handovers.put(came)
-    assert find_handover(station, "11111") == find_handover(station, ID.upper()) == row
+    assert find_handover(station, "11111") == find_handover(station, ID) == row
+    letters = replace(row, id="abcd1111-2222-4333-8444-555555555555")
+    station.handovers.put(letters)
+    assert find_handover(station, "ABCD") == find_handover(station, letters.id.upper()) == letters
     for text in ("1111", "111", "", "aaaa1", "2222", "11111 "):
         with pytest.raises(NotFoundError):
             find_handover(station, text)
@@ -186,11 +190,14 @@ def test_the_receipt_of_a_move_deletes_the_keys_that_were_in_it_and_gives_back_w
 ) -> None:
     left(station, notes=named())
     station.keys.add_pending(A, key=bytes(16), key_id=b"newer___", epoch=2)
+    for uuid in (A, B):
+        station.datasheets.keep_draft(Draft(uuid, Image(uuid, {})))
     octets = receipt(station, A, refused=(B,))
     done = close(station, b"\n" + octets + b"\n")
     assert (done.fresh, done.row.state, done.receipt.imported) == (True, "closed", (A,))
     assert [key.epoch for key in station.keys.keys_of(A)] == [2], "a key made since was not in it"
     assert len(station.keys.keys_of(B)) == 1
+    assert [draft.uuid for draft in station.datasheets.drafts()] == [B], "of what is given away nothing is written"
     assert [entry.uuid for entry in station.policy.tombstones()] == [A]
     assert station.keys.rotation_due(B) == f"the move {ID} did not happen"
     assert [event for event in told if event[0] == "undone"] == [
@@ -238,6 +245,10 @@ def test_a_copy_for_two_is_closed_by_the_second_receipt(station: Station, told: 
 
 def test_a_receipt_of_an_undone_move_says_how_many_keys_are_out(station: Station, told: Events) -> None:
     row = left(station, "move", "undone", notes=named())
+    before = station.audit_log.newest()
+    with pytest.raises(PolicyError, match="was undone here"):
+        close(station, receipt(station, A, refused=(B,)), dry_run=True)
+    assert station.audit_log.newest() == before
     with pytest.raises(PolicyError) as caught:
         close(station, receipt(station, A, refused=(B,)))
     assert caught.value.message == "This move was undone here, but station south took 1 key in all the same."

@@ -260,6 +260,9 @@ def test_a_new_key_is_wrapped_under_the_master_key_of_now(station: Station, monk
     monkeypatch.setattr(type(station.identity), "master", property(lambda identity: 7))
     agreed(station, A, 2)
     assert reread == ["vault"]
+    (newest, _) = station.keys.keys_of(A)
+    station.keys.correct_epoch(newest, 5)
+    assert reread == ["vault", "vault"], "before a key is wrapped once more, too"
 
 
 def test_of_nine_pending_keys_the_oldest_goes_and_the_active_one_stays(station: Station) -> None:
