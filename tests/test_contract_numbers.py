@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
+
 from teds_provision import client, firmware_image
 from teds_provision.api import bodies, operations
+from teds_provision.backup import chunks, sealed_file
 from teds_provision.cli.measure.record import SHOWN
+from teds_provision.doctor import fleet, machine, report
+from teds_provision.doctor import station as doctor_station
+from teds_provision.handover import outgoing, trust
 from teds_provision.limits import LIMITS
 from teds_provision.links import ports
 from teds_provision.links.ble import airtime
@@ -32,17 +38,19 @@ from teds_provision.ncap import history, live, membership, waits
 from teds_provision.ncap.nodes import actuator_leases, simulation
 from teds_provision.ncap.web import app, guard, tokens
 from teds_provision.node.wrapped import description
-from teds_provision.protocol import announce, fingerprints
+from teds_provision.protocol import announce, datasheet, fingerprints, repetition
+from teds_provision.protocol.handover import bundle, jose, revocation, strict_json
 from teds_provision.protocol.messages import firmware
 from teds_provision.protocol.operation import budget
 from teds_provision.provisioning import batch_sheet, image_manager, update, whitelist
-from teds_provision.station import groups, label
+from teds_provision.station import datasheets, groups, label, node_keys, pins, policy, row_macs
 from teds_provision.station import nodes as known_nodes
+from teds_provision.station.store import connection, lock, row_sample, schema
 from teds_provision.teds import channel, curve
 from teds_provision.teds.calibration import files as calibration_files
 from teds_provision.teds.calibration.model import MAXIMUM_INPUTS
 from teds_provision.teds.codec import decode
-from teds_provision.vault import agent
+from teds_provision.vault import agent, ca_file, master, passphrase, pkcs11
 
 
 def test_the_numbers_of_the_contract() -> None:
@@ -158,5 +166,53 @@ def test_the_numbers_of_the_guides() -> None:
              whitelist._MOST_LINES, whitelist._MAX_TAG),
             (67_108_864, 250_000, 16, 3_000_000, 1_000_000, 65_536),
         ),
+    }  # fmt: skip
+    assert {what: one for what, (one, _) in numbers.items()} == {what: due for what, (_, due) in numbers.items()}
+
+
+def test_the_numbers_of_stores_vaults_and_handovers() -> None:
+    numbers: dict[str, tuple[object, object]] = {
+        # docs/store.md
+        "a check reads a sample": ((row_sample.SAMPLED, row_sample._NEWEST), (5000, 500)),
+        "keys that wait for their proof": (node_keys.MAX_PENDING, 8),
+        "a Confirm may be late": (node_keys.CONFIRM_MAY_ARRIVE, timedelta(minutes=2)),
+        "the present datasheet and ten older ones": (datasheets.KEPT, 11),
+        "a MAC of a row": ((row_macs.MAC_OCTETS, row_macs.KEY_OCTETS), (16, 32)),
+        "one wrong key of a UUID is recorded in ten minutes": (pins.RECORD_AGAIN, 600.0),
+        "who waits for the store, and for a node": ((connection.BUSY_SECONDS, lock._TURN_SECONDS), (10.0, 60.0)),
+        "a store": ((schema.APPLICATION_ID, schema.OLDEST_SCHEMA), (0x54454453, 7)),
+        "a backup": ((sealed_file.MAX_OCTETS, chunks.CHUNK_OCTETS), (17_179_869_184, 1_048_576)),
+        "a backup gets old": (doctor_station._BACKUP_DAYS, 90),
+        "how many names a check shows": ((policy._SHOWN, fleet._SHOWN), (5, 5)),
+        "the last errors of a report": (report._LAST_ERRORS, 20),
+        "years that a clock may show": ((machine._FIRST_YEAR, machine._LAST_YEAR), (2025, 2099)),
+        # docs/security.md
+        "Argon2id": (
+            (passphrase.PRODUCT.memory_kib, passphrase.PRODUCT.iterations, passphrase.PRODUCT.lanes), (65_536, 3, 4)
+        ),
+        "what a forged vault may cost": (
+            (passphrase._MAX_MEMORY_KIB, passphrase._MAX_WORK_KIB, passphrase._MAX_LANES), (196_608, 2_097_152, 16)
+        ),
+        "a passphrase": ((passphrase.MIN_CHARACTERS, passphrase.MAX_OCTETS), (8, 1024)),
+        "PBKDF2 of an exported CA key": ((ca_file.ROUNDS, ca_file.MAX_ROUNDS), (600_000, 10_000_000)),
+        "master and wrapped keys": ((master.MASTER_OCTETS, master._VERSION), (32, 1)),
+        "who waits for a token": (pkcs11._WAIT_SECONDS, 30.0),
+        "the secret of an agent": (agent.MOST_OCTETS, 1024),
+        # docs/handover.md, docs/profile.md
+        "a bundle": (
+            (outgoing.DEFAULT_DAYS, outgoing.NODES_IN_A_BUNDLE, bundle.MAX_BUNDLE_OCTETS, jose.MAX_RECIPIENTS),
+            (7, 50_000, 67_108_864, 256),
+        ),
+        "a sender's clock may be ahead": (bundle.CLOCK_TOLERANCE, timedelta(minutes=10)),
+        "a text in a bundle": (strict_json._MAX_TEXT, 1024),
+        "a statement, a request, a key file": (
+            (revocation.MAX_OCTETS, trust.MAX_OCTETS, trust.MAX_KEY_FILE), (16_384, 16_384, 65_536)
+        ),
+        "digits of a trusted key": ((trust._MIN_PREFIX, policy._MIN_FINGERPRINT_PREFIX), (8, 16)),
+        "the next sequence": (datasheet.SEQUENCE_WINDOW, 65_536),
+        "TEDS that a node stores": (
+            (sorted(datasheet.STORED_CODES), datasheet.LAST_CHANNEL), ([*range(1, 18), *range(128, 136)], 255)
+        ),
+        "a reply is repeated": (repetition.KEEP_SECONDS, 20.0),
     }  # fmt: skip
     assert {what: one for what, (one, _) in numbers.items()} == {what: due for what, (_, due) in numbers.items()}

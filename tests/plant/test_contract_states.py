@@ -18,10 +18,15 @@ from teds_provision.plant import (
     apply_pages,
     doctor,
     folder_transport,
+    jobs,
+    line,
     office,
     owner,
     parcels,
+    postgres,
     removed_members,
+    schema,
+    scram,
     service,
     sign_requests,
     status,
@@ -104,6 +109,14 @@ def test_the_numbers_of_the_contract() -> None:
         "why an office signs nothing": (
             set(signing.REFUSALS),
             {"not-line", "job", "full", "other-key", "proof", "differs", "guard", "sequence", "revoked"},
+        ),
+        "a parcel out of a line waits for 31 days": (parcels._DAYS_OF_A_LINE, 31),
+        "removals are looked at each hour": (removed_members.EVERY, timedelta(hours=1)),
+        "connecting, and a statement": ((postgres.CONNECTING, postgres.STATEMENT), (10, 60)),
+        "a login has a secret of 32 octets": ((scram.SECRET_OCTETS, scram._ITERATIONS), (32, 4096)),
+        "a login has six connections": ((schema.VERSION, schema.CONNECTIONS), (2, 6)),
+        "a calibration and a profile of a job": (
+            (office._MAX_CALIBRATION, line._MAX_CALIBRATION, jobs._MAX_PROFILE_OCTETS), (1_048_576,) * 3
         ),
         "the first member": (owner.FIRST_ROLES, {"keeper", "sign", "line", "base"}),
     }  # fmt: skip
