@@ -342,8 +342,10 @@ def test_a_path_in_the_file_means_the_same_file_wherever_the_command_is_typed(
 def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
     settings = {
         "trace": "frames.pcapng",
-        "profile": "gripper",
         "provision": {"profile": "own/arm.toml", "name": "a/b"},
+        "build": {"profile": "arm.toml", "calibration": "~/arm.csv"},
+        "profile": "gripper",
+        "node": {"create": {"profile": "types/arm", "teds": ["a.json", "/b.json"]}},
         "backup": {"to": "office.pem"},
         "measure": {"to": ["run.csv", "mqtt:lab"]},
         "export-keys": {"to": "north"},
@@ -359,6 +361,8 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
         "trace": "/etc/teds/frames.pcapng",
         "profile": "gripper",
         "provision": {"profile": "/etc/teds/own/arm.toml", "name": "a/b"},
+        "build": {"profile": "/etc/teds/arm.toml", "calibration": str(Path.home() / "arm.csv")},
+        "node": {"create": {"profile": "/etc/teds/types/arm", "teds": ["/etc/teds/a.json", "/b.json"]}},
         "backup": {"to": "/etc/teds/office.pem"},
         "measure": {"to": ["/etc/teds/run.csv", "mqtt:lab"]},
         "export-keys": {"to": "north"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,53 @@ def test_a_bus_that_is_named_is_meant() -> None:
         ({}, ["--nfc", READER, "--ble", AIR], False, "ble"),  # the reader for the tap, the air for the rest
     ):
         assert taken(kept, *typed, streams=streams) == via, (kept, typed, streams)
+
+
+@pytest.mark.parametrize(
+    ("kept", "typed", "via", "chosen", "reader_chosen"),
+    [
+        ({}, [], "nfc", False, False),
+        ({}, ["--nfc", READER], "nfc", False, True),
+        ({"nfc": READER}, [], "nfc", False, False),  # a reader of this machine: the node may be elsewhere as well
+        ({}, ["--can", BUS], "can", True, False),
+        ({"nfc": READER}, ["--can", BUS], "can", True, False),
+        ({"can": BUS}, [], "nfc", False, False),  # where it is looked for first, but a tap will do
+        ({}, ["--can", BUS, "--can", "socketcan:can1"], "can", True, False),
+        ({}, ["--ble", AIR], "ble", True, False),
+        ({"can": BUS}, ["--ble", AIR], "ble", True, False),
+        ({"nfc": READER}, ["--ble", AIR], "nfc", False, False),  # tapped there first
+        ({}, ["--nfc", READER, "--ble", AIR], "nfc", False, True),
+        ({}, ["--can", BUS, "--ble", AIR], "nfc", False, False),  # two were named
+        ({}, ["--can", BUS, "--nfc", READER], "nfc", False, True),
+        ({}, ["--via", "nfc"], "nfc", True, False),
+        ({}, ["--via", "ble", "--can", BUS], "ble", True, False),
+        ({"via": "can"}, [], "can", True, False),
+        ({"via": "ble"}, ["--can", BUS], "ble", True, False),
+    ],
+)
+def test_one_link_that_is_typed_is_chosen_and_one_that_is_kept_is_not(
+    kept: dict[str, str], typed: list[str], via: str, chosen: bool, reader_chosen: bool
+) -> None:
+    links = given(kept, *typed)
+    assert (links.via, links.via_chosen, links.reader_chosen) == (via, chosen, reader_chosen)
+    typed_buses = [word for option, word in pairwise(typed) if option == "--can"]
+    buses = typed_buses or [value for name, value in kept.items() if name == "can"]
+    assert links.can == (None if not buses else buses[0] if len(buses) == 1 else tuple(buses))
+    assert links.nfc == ((READER,) if "nfc" in kept or "--nfc" in typed else None)
+    assert links.ble == (AIR if "--ble" in typed else None)
+
+
+@pytest.mark.parametrize(
+    ("foxglove", "at", "address"),
+    [
+        (False, None, None),
+        (True, None, "127.0.0.1:8765"),
+        (True, "0.0.0.0:9", "0.0.0.0:9"),
+        (False, "[::]:9", "[::]:9"),
+    ],
+)
+def test_foxglove_serves_the_address_that_is_named_for_it(foxglove: bool, at: str | None, address: str | None) -> None:
+    assert options.foxglove_address(foxglove, at) == address
 
 
 def test_who_names_a_time_has_the_nodes_collected_for_so_long() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,14 +24,17 @@ from teds_provision.station.store.records import Draft
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile import load_profile
+from teds_provision.teds.profile.load import shipped_profiles
+from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.units import parse_unit
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 FORCE, VOLT, AMPERE, RADIAN = (parse_unit(text).units for text in ("N", "V", "A", "rad"))
 
 
-def channel(kind: int = 0, units: Units | None = FORCE, model: int = 0, octets: int = 2) -> bytes:
-    fields: dict[str, object] = {"ChanType": kind, "Sample": {"DatModel": model, "ModLenth": octets, "SigBits": 8}}
+def channel(kind: int | None = 0, units: Units | None = FORCE, model: int = 0, octets: int = 2) -> bytes:
+    fields: dict[str, object] = {"Sample": {"DatModel": model, "ModLenth": octets, "SigBits": 8}}
+    fields |= {"ChanType": kind} if kind is not None else {}
     return teds.compose(3, fields | ({"PhyUnits": units} if units is not None else {}))
 
 
@@ -58,6 +63,13 @@ def changes(has: dict[BlockId, bytes], wanted: dict[BlockId, bytes], **more: tup
             ("Channel 1 gives values of unsigned integer, 3 octets, not values of unsigned integer, 2 octets.",),
         ),
         (channel(model=1, octets=4), channel(), ("Channel 1 gives values of Float32",)),
+        (
+            channel(model=1, octets=4),
+            channel(octets=4),
+            ("Channel 1 gives values of Float32, 4 octets, not values of unsigned integer, 4 octets.",),
+        ),
+        (channel(None), channel(1), ()),  # it does not say
+        (channel(1), channel(None), ()),
         (channel(1, RADIAN), channel(0), ("Channel 1 is an actuator, not a sensor.", "Channel 1 is in rad, not in N.")),
         (channel(units=VOLT), channel(), ("Channel 1 is in V, not in N.",)),
     ],
@@ -107,6 +119,69 @@ def test_a_datasheet_is_of_a_type_with_exactly_its_channels_and_units() -> None:
     assert misfit(Image(UUID, {}), profile) == f"Its channels are none, not {shown}."
     more = {**built, (last + 1, 3): built[last, 3]}
     assert misfit(Image(UUID, more), profile).endswith(f", {last + 1}, not {shown}.")
+
+
+def test_a_datasheet_of_a_type_states_its_units_and_not_only_calibrations(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text((shipped_profiles() / "load-cell.toml").read_text())
+    profile = load_profile(str(tmp_path / "own.toml"))
+    (one,) = profile.channels
+    built = dict(profile.build(UUID).blocks)
+    own = Sheet.from_image(Image(UUID, built)).channels[0]
+    form = own.sample
+    assert form is not None
+    for units, why in (
+        (own.units, ""),
+        (replace(own.units, extension=9), ""),
+        (None, "Channel 1 is in count, not in N."),
+        (RADIAN, "Channel 1 is in rad, not in N."),
+        (VOLT, "Channel 1 is in V, not in N."),  # a raw unit: no difference of a board, but no datasheet of this type
+    ):
+        block = channel(int(own.kind or 0), units, form.model, form.octets)
+        assert misfit(Image(UUID, {**built, (1, 3): block}), profile) == why, units
+    assert one.calibration.required
+    beside = {**built, (2, 5): b"a calibration of a channel that nothing describes"}
+    assert misfit(Image(UUID, beside), profile) == ""
+
+
+def test_a_chosen_name_of_a_board_that_says_nothing_is_held_against_what_it_had(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    had = Image(UUID, sheet(channel()))
+    monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: had)
+    monkeypatch.setattr(type(station.measurements), "names_of", lambda *_: {1: "grip"})
+    wanted, same = (Image(UUID, sheet(channel(units=units))) for units in (RADIAN, FORCE))
+    for has in (None, Image(UUID, {}), Image(UUID, {(0, 12): b"x"})):
+        (warning,) = topic_warnings(station, has, wanted)
+        assert warning.startswith(
+            "The chosen topic name 'grip' stays with channel 1, which was in N and is in rad now."
+        )
+        assert topic_warnings(station, has, same) == ()
+    assert topic_warnings(station, Image(UUID, sheet(channel(units=RADIAN))), wanted) == (), "what it has goes before"
+
+
+@pytest.mark.parametrize(
+    ("profiles", "wanted", "factory", "known"),
+    [
+        (("gripper",), "gripper", False, True),
+        (("gripper",), "load-cell", False, False),
+        (("gripper",), "load-cell", True, True),  # ours, after a reset
+        ((None, "gripper"), "gripper", False, True),  # the newest whose profile is known
+        (("load-cell", "gripper"), "gripper", False, False),
+        (("load-cell", "gripper"), "load-cell", False, True),
+    ],
+)
+def test_a_board_is_remembered_as_what_it_was_last_written_to_be(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    profiles: tuple[str, ...],
+    wanted: str,
+    factory: bool,
+    known: bool,
+) -> None:
+    history = [SimpleNamespace(profile=profile) for profile in profiles]
+    station.nodes.remember(UUID, profile=wanted)  # by a build, or a bundle: what was written counts
+    monkeypatch.setattr(type(station.datasheets), "history", lambda *_: history)
+    assert is_remembered(station, UUID, wanted, factory=factory) == known
 
 
 def test_a_chosen_name_that_will_mean_something_else_is_warned_about(station: Station) -> None:

@@ -15,8 +15,9 @@ import pytest
 from teds_provision import teds
 from teds_provision.doctor.checks import System
 from teds_provision.doctor.fleet import nodes
+from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NodeSilentError
 from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
-from teds_provision.protocol.messages.frames import Reply
+from teds_provision.protocol.messages.frames import Reason, Reply
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 from teds_provision.provisioning import identify as identify_step
@@ -29,6 +30,7 @@ from teds_provision.provisioning.firmware import (
     firmware_warning,
     keep_firmware,
     read_firmware,
+    require_firmware,
     require_good_firmware,
 )
 from teds_provision.provisioning.identify import add_to_whitelist, identify
@@ -407,3 +409,99 @@ def test_a_type_is_read_once_for_all_nodes_that_come_together_and_again_when_it_
     assert demand is not None
     assert demand.text == "nrf/other"
     assert FirmwareDemands(tmp_path).demand_of(str(tmp_path / "none.toml")) is None
+
+
+# -- one question ------------------------------------------------------------------------------------------------------
+
+
+class Asked:
+    """A node that is asked for its firmware: what it answers, and by which kind of request it was asked."""
+
+    def __init__(self, answer: object, *, sealed: bool = False, wired: bool = True, state: str = "KEYED") -> None:
+        self.answer, self.sealed, self.wired = answer, sealed, wired
+        self.identity = SimpleNamespace(state=NodeState[state])
+        self.open_counter = bytes(8) if sealed else None
+        self.reported_firmware: Any = None
+        self.requests: list[str] = []
+
+    def _reply(self, how: str) -> bytes:
+        self.requests.append(how)
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        assert isinstance(self.answer, FirmwareReport)
+        return self.answer.encode()
+
+    def request(self, _command: object, _why: str) -> bytes:
+        return self._reply("once")
+
+    def request_idempotent(self, _command: object, _why: str) -> bytes:
+        return self._reply("until it answers")
+
+    def read(self, **how: bool) -> FirmwareReading | None:
+        return read_firmware(cast("Conversation", self), **how)
+
+
+@pytest.mark.parametrize(
+    ("sealed", "wired", "state", "asks"),
+    [
+        (False, True, "KEYED", True),
+        (False, True, "FACTORY", True),
+        (False, False, "FACTORY", True),  # a tag, or the air: a node without a key answers anyone
+        (False, False, "KEYED", False),  # it would refuse with 3
+        (False, False, "PROVISIONED", False),
+        (True, False, "PROVISIONED", True),
+    ],
+)
+def test_a_node_is_asked_where_it_may_answer(sealed: bool, wired: bool, state: str, asks: bool) -> None:
+    node = Asked(GOOD, sealed=sealed, wired=wired, state=state)
+    assert node.read() == (FirmwareReading(GOOD, sealed=sealed) if asks else None)
+    assert node.requests == ["until it answers"] * asks
+    node.read()
+    assert len(node.requests) == asks, "once for each session"
+
+
+def test_a_node_that_refuses_for_now_is_asked_again_and_one_that_cannot_report_is_not() -> None:
+    for reason, reading, times in ((Reason.BUSY, None, 2), (Reason.UNKNOWN_COMMAND, FirmwareReading(None, False), 1)):
+        node = Asked(NodeRefusedError("no", reason=reason))
+        assert node.read() == node.read() == reading
+        assert len(node.requests) == times
+
+
+@pytest.mark.parametrize("error", [NodeSilentError("silent"), GarbledError("torn")])
+def test_an_answer_that_is_lost_is_an_error_unless_it_was_asked_in_passing(error: LinkError) -> None:
+    node = Asked(error)
+    with pytest.raises(type(error)):
+        node.read()
+    assert node.read(once=True) is None
+    assert node.requests == ["until it answers", "once"]
+
+
+@pytest.mark.parametrize(
+    ("demand", "reading", "text"),
+    [
+        (None, FirmwareReading(OLD, sealed=False), None),
+        (DEMAND, None, None),  # it could not be asked here: the session asks
+        (DEMAND, FirmwareReading(GOOD, sealed=False), None),
+        (DEMAND, FirmwareReading(TRIAL, sealed=True), None),
+        (DEMAND, FirmwareReading(PENDING, sealed=True), None),
+        (DEMAND, FirmwareReading(None, sealed=False), "does not report its firmware (wanted: */angle)"),
+        (DEMAND, FirmwareReading(OLD, sealed=False),
+         "runs outdated firmware: nrf/angle 1.1.0+3 (wanted: */angle, at least 1.2.0)"),
+        (DEMAND, FirmwareReading(FirmwareReport("nrf/arm", (1, 2, 0), 3, bytes([4]) * 32), sealed=True),
+         "runs other firmware than its type: nrf/arm 1.2.0+3 (wanted: */angle)"),
+        (FirmwareDemand(bad=("1.2.0",)), FirmwareReading(GOOD, sealed=True),
+         "runs firmware that its type rules out: nrf/angle 1.2.0+3"),
+    ],
+)  # fmt: skip
+def test_what_a_board_is_refused_for_and_what_was_wanted(
+    demand: FirmwareDemand | None, reading: FirmwareReading | None, text: str | None
+) -> None:
+    uuid = bytes(10)
+    if text is None:
+        require_firmware(uuid, demand, reading)
+        return
+    with pytest.raises(FirmwareError) as refused:
+        require_firmware(uuid, demand, reading)
+    assert refused.value.message == f"Board {uuid.hex()} {text}. Nothing was signed."
+    assert refused.value.hint == (f"Install other firmware in the same run: provision {uuid.hex()} --firmware IMAGE")
+    assert (refused.value.code, refused.value.exit_code) == ("firmware", 6)

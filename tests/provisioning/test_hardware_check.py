@@ -33,7 +33,7 @@ CLAIMED_HERE, CLAIMED_BY_OTHER = 2, 4
 OPERATE, SAMPLE, OPERATION = 18, 12, 19
 
 
-def datasheet(*kinds: int) -> Image:
+def datasheet(*kinds: int, **more: object) -> Image:
     """Return a datasheet of channels with Float32 values in m, which need no calibration."""
     blocks: dict[BlockId, bytes] = {(0, 128): SECURITY}
     for number, kind in enumerate(kinds, 1):
@@ -41,6 +41,7 @@ def datasheet(*kinds: int) -> Image:
             "ChanType": kind,
             "PhyUnits": parse_unit("m").units,
             "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 24},
+            **more,
         }
         blocks[number, 3] = teds.compose(3, fields)
     return Image(UUID, blocks)
@@ -58,6 +59,7 @@ class Node:
         self.operation: Reason | None = facts.get("operation")
         self.sampling: Reason | None = facts.get("sampling")
         self.asked: list[tuple[str, Any]] = []
+        self.value: float | None = None
         self.claimed: set[int] = set()
         self.uuid = UUID
 
@@ -74,7 +76,8 @@ class Node:
             if self.sampling is not None:
                 raise NodeRefusedError("busy", reason=self.sampling)
             bad = bool(self.invalid & set(numbers))
-            floats, raws = struct.pack(f">{len(numbers)}f", *numbers), bytes(self.octets * len(numbers))
+            values = [self.value or number for number in numbers]
+            floats, raws = struct.pack(f">{len(values)}f", *values), bytes(self.octets * len(numbers))
             return struct.pack(">QB", 1, bad) + (raws or floats)
         if len(payload) < 16:
             self.asked.append(("idle", channel))
@@ -205,6 +208,18 @@ def test_invalid_readings_are_a_warning_and_no_value() -> None:
     assert found.warnings == ("The readings of channels 1, 2 are invalid.",)
     json = found.samples[0]
     assert math.isfinite(json["channel"])
+
+
+def test_a_reading_outside_of_the_limits_or_that_is_no_number_is_invalid() -> None:
+    found = check(Node(), datasheet(*[SENSOR] * 3, LowLimit=1.5, HiLimit=2.5))
+    assert [(sample["value"], sample["valid"]) for sample in found.samples] == [
+        (None, False), (2.0, True), (None, False),
+    ]  # fmt: skip
+    assert found.warnings == ("The readings of channels 1, 3 are invalid.",)
+    node = Node()
+    node.value = math.nan
+    (sample,) = check(node, datasheet(SENSOR)).samples
+    assert (sample["value"], sample["shown"]["value"], sample["valid"]) == (None, None, False)
 
 
 @pytest.mark.parametrize(
