@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cached_property
+from typing import Final
 
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.snapshot import Relation, extend_audit
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import KeyRecord, RevocationRecord, Tombstone, WhitelistEntry
+from teds_provision.station.store.audit import AuditFilter
+from teds_provision.station.store.records import (
+    KeyRecord,
+    RevocationRecord,
+    Tombstone,
+    TrustRecord,
+    WhitelistEntry,
+)
+
+_OUT_OF_SERVICE: Final = ("decommissioned", "replaced by")  # the words that handover/life.py writes
 
 
 class Merge:
@@ -35,11 +48,7 @@ class Merge:
         """Bring everything in the order in which one part looks at the other."""
         if self.newer:
             self.back["audit entries"] = extend_audit(self.live, self.copy)
-        for revocation in self.copy.policy.revocations():
-            if self.live.policy.revocation(revocation.uuid) is None:
-                self.live.policy.deny(revocation)
-                self.back["revocations"] += 1
-        self.kept["revocations made since"] = _more(self.live.policy.revocations(), self.copy.policy.revocations())
+        self._bans()
         self._handovers()
         self._nodes()
         self._whitelist()
@@ -51,11 +60,27 @@ class Merge:
         self._marks()
         self._groups()
         self._names()
+        self._measurements()
         self._line()
+        self._unsent()
 
     def kept_sentences(self) -> list[str]:
         """Return sentences about what stayed."""
         return [f"{what}: {count}" for what, count in self.kept.items() if count]
+
+    def _bans(self) -> None:
+        """Merge the deny list: a ban that a person lifted here stays lifted, as it is about that very statement."""
+        for revocation in self.copy.policy.revocations():
+            if self.live.policy.revocation(revocation.uuid) is not None:
+                continue
+            if self.live.policy.was_lifted(revocation.statement):
+                self.kept["bans lifted since"] += 1
+                continue
+            self.live.policy.deny(revocation)
+            self.back["revocations"] += 1
+            if self.live.plant.joined is not None:  # stations may have lifted it since: the next fold of pages decides
+                self.live.plant.claims.queue([revocation.uuid])
+        self.kept["revocations made since"] = _more(self.live.policy.revocations(), self.copy.policy.revocations())
 
     def _handovers(self) -> None:
         for handover in self.copy.handovers.all():
@@ -120,6 +145,8 @@ class Merge:
                 self.kept["revoked nodes off the whitelist"] += known is None
             elif entry.fingerprint is not None and pin not in (None, entry.fingerprint):
                 self.kept["whitelist entries pinned to another key now"] += 1
+            elif known is None and entry.uuid in self.removals and entry.added <= self.removals[entry.uuid]:
+                self.kept["nodes taken off the whitelist since"] += 1
             elif known is None or (self.newer and known != entry):
                 self.live.pins.restore([entry])
                 self.back["whitelist"] += 1
@@ -173,16 +200,50 @@ class Merge:
                 self.back["datasheets"] += 1
 
     def _trust(self) -> None:
+        """Merge trusted keys: one that a person removed here stays removed, and one that a newer copy removed goes."""
+        if self.newer:
+            known = {(record.fingerprint, record.role) for record in self.copy.policy.trust_rows()}
+            for record in self.live.policy.trust_rows():
+                if (record.fingerprint, record.role) not in known and self._trust_ended(record):
+                    self.live.policy.drop_trust(record)
+                    self.back["trust ended"] += 1
         names = {record.name for record in self.live.policy.trust_rows()}
         keys = {(record.fingerprint, record.role) for record in self.live.policy.trust_rows()}
         for record in self.copy.policy.trust_rows():
             if (record.fingerprint, record.role) in keys:
+                continue
+            if self._trust_ended(record):
+                self.kept["keys no longer trusted since"] += 1
                 continue
             if record.name in names:
                 self.kept[f"the name {record.name!r} for the key trusted under it now"] += 1
                 continue
             self.live.policy.restore_trust(record)
             self.back[f"trust in {record.role} {record.name}"] += 1
+
+    def _trust_ended(self, record: TrustRecord) -> bool:
+        """Return True if this store's log states that the trust in a key was ended after it was added."""
+        return record.added <= self.distrusted.get((record.fingerprint, record.role), "")
+
+    @cached_property
+    def distrusted(self) -> dict[tuple[str, str], str]:
+        """When trust in a key and role was last removed, by the log of this store."""
+        entries = self.live.audit_log.chosen(AuditFilter(act="trust"))
+        return {
+            (str(entry.detail.get("key")), str(entry.detail.get("role"))): entry.at
+            for entry in entries
+            if entry.outcome == "removed"
+        }
+
+    @cached_property
+    def removals(self) -> dict[bytes, str]:
+        """When a node was last taken off the whitelist or out of service, by the log of this store."""
+        removed = dict[bytes, str]()
+        for act, outcomes in (("whitelist", ("removed",)), ("decommission", _OUT_OF_SERVICE)):
+            for entry in self.live.audit_log.chosen(AuditFilter(act=act)):
+                if entry.uuid is not None and entry.outcome.startswith(outcomes):
+                    removed[entry.uuid] = max(entry.at, removed.get(entry.uuid, ""))
+        return removed
 
     def _decisions(self) -> None:
         """Merge the CAs whose trust a person ended, and the bans that a person lifted.
@@ -254,6 +315,35 @@ class Merge:
                 continue
             live.set_frame(uuid, channel, frame)
             self.back["frames"] += 1
+
+    def _measurements(self) -> None:
+        """Merge what the service measures: add what is missing here, replace by that of a newer copy.
+
+        Rows of an older copy that this store lacks were ended since; a command's measurement ended with the command.
+        """
+        if self.older:
+            return
+        present = {kept.id: kept for kept in self.live.measurements.lasting()}
+        for wanted in self.copy.measurements.lasting():
+            known = present.get(wanted.id)
+            if known == wanted or (known is not None and not self.newer):
+                continue
+            if wanted.group is not None and self.live.groups.find(wanted.group) is None:
+                self.kept["measurements whose group is gone"] += 1
+                continue
+            self.live.measurements.keep(wanted)
+            self.back["measurements"] += 1
+
+    def _unsent(self) -> None:
+        """Merge events for the plant that wait for a page; an older copy's are in this store or in its pages."""
+        joined, theirs = self.live.plant.joined, self.copy.plant.joined
+        if self.older or joined is None or theirs is None or joined.registry != theirs.registry:
+            return
+        known = self.live.plant.own_events()
+        for _, event_id, text in self.copy.plant.outbox(sys.maxsize):
+            if event_id not in known:
+                self.live.plant.queue_event(json.loads(text))
+                self.back["events for the plant"] += 1
 
     def _line(self) -> None:
         """Merge jobs, units, evidence and requests to an office: a station removes none of them, so none is too old."""

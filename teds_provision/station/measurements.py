@@ -67,6 +67,10 @@ class Measurements:
                 self.forget(measurement_id)
         return [measurement for measurement in kept if measurement.id not in dead]
 
+    def lasting(self) -> list[KeptMeasurement]:
+        """Return those that are kept until they are deleted, oldest first: none of a command's."""
+        return [measurement for measurement in self._rows() if measurement.lasting]
+
     def due(self) -> list[KeptMeasurement]:
         """Return those that ``ncap`` measures now: its own, the page's and the API's that are not past their end."""
         return [measurement for measurement in self.all() if measurement.lasting and not _is_past(measurement)]

@@ -146,6 +146,10 @@ class Policy:
                 (record.name, record.role, record.point, record.fingerprint, record.added, record.mac),
             )
 
+    def drop_trust(self, record: TrustRecord) -> None:
+        """Remove a row of the trusted keys, for restore: a newer copy of this store has it no more."""
+        self._store.execute("DELETE FROM trust WHERE fingerprint = ? AND role = ?", (record.fingerprint, record.role))
+
     def distrust(self, name_or_fingerprint: str) -> bool:
         """Trust a key no more (the vault opens); False if none fits, raises UsageError if several do.
 

@@ -10,13 +10,17 @@ import pytest
 
 from teds_provision.backup.merge import Merge
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.plant.event import hash_of_statement
+from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.snapshot import Relation
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import (
+    COMMAND,
     Draft,
     Group,
     Handover,
     Holder,
+    KeptMeasurement,
     KeyFlags,
     KeyRecord,
     NodeRecord,
@@ -267,6 +271,70 @@ def test_a_key_is_trusted_under_the_name_that_it_has_here(two: Two) -> None:
     again.kept["nothing of this"] = 0
     assert again.kept_sentences() == []
     assert done.kept_sentences() == ["the name 'north' for the key trusted under it now: 1"]
+
+
+TRUSTED = TrustRecord("north", "ca", POINT, KEY, AT)
+
+
+@pytest.mark.parametrize("how", [OLDER, OTHER])
+def test_what_a_person_ended_here_stays_ended(two: Two, how: Relation) -> None:
+    ban = RevocationRecord(B, None, "lost", "a.b.c", AT)
+    two.copy.policy.restore_trust(TRUSTED)
+    two.copy.policy.deny(ban)
+    two.copy.pins.restore([WhitelistEntry(A, KEY, AT)])
+    two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY)
+    two.live.audit("whitelist", A, "removed")
+    two.live.policy.restore_lifted(hash_of_statement(ban.statement), b"m" * 16)
+    done = two.merged(how)
+    assert dict(done.back) == {}
+    assert dict(done.kept) == {
+        "keys no longer trusted since": 1, "bans lifted since": 1, "nodes taken off the whitelist since": 1,
+    }  # fmt: skip
+
+
+def test_what_was_given_again_after_its_end_comes_back(two: Two) -> None:
+    again = "2999-01-01T00:00:00Z"
+    two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY)
+    two.live.audit("decommission", A, "decommissioned")
+    two.live.audit("decommission", B, "no-node")
+    two.copy.policy.restore_trust(replace(TRUSTED, added=again))
+    two.copy.policy.restore_trust(replace(TRUSTED, name="the station", role="station"))
+    two.copy.pins.restore([WhitelistEntry(A, KEY, again), WhitelistEntry(B, KEY, AT)])
+    back = {"trust in ca north": 1, "trust in station the station": 1, "whitelist": 2}
+    assert dict(two.merged(OTHER).back) == back
+
+
+def test_trust_that_a_newer_copy_ended_ends_here(two: Two) -> None:
+    for how, names in ((OTHER, ["north"]), (NEWER, [])):
+        two.live.policy.restore_trust(TRUSTED)
+        two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY)  # as extend_audit brings it
+        two.merged(how)
+        assert [record.name for record in two.live.policy.trust_rows()] == names
+
+
+def test_kept_measurements_come_from_a_copy_that_is_not_older(two: Two) -> None:
+    two.copy.groups.put(Group("hand", (A,), AT))
+    kept = two.copy.measurements.keep(KeptMeasurement("m1", group="hand"))
+    two.copy.measurements.keep(KeptMeasurement("m2", uuids=(B,), owner=COMMAND, pid=1, started=1))
+    assert dict(two.merged(OLDER).back) == {}
+    assert two.merged(OTHER).back["measurements"] == 1
+    assert two.live.measurements.lasting() == [kept]
+    changed = two.copy.measurements.keep(replace(kept, owner="page"))
+    assert two.merged(OTHER).back["measurements"] == 0
+    assert two.merged(NEWER).back["measurements"] == 1
+    assert two.live.measurements.lasting() == [changed]
+
+
+def test_events_for_the_plant_that_wait_come_once_from_a_copy_that_is_not_older(two: Two) -> None:
+    for store in (two.live, two.copy):
+        store.plant.put_record(PlantRecord("6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"))
+    two.live.plant.record_event("unpinned", A)
+    two.copy.plant.record_event("unpinned", B)
+    [(_, event, text)] = two.copy.plant.outbox(9)
+    assert dict(two.merged(OLDER).back) == {}
+    assert dict(two.merged(OTHER).back) == {"events for the plant": 1}
+    assert dict(two.merged(NEWER).back) == {}, "once"
+    assert [(kept, stated) for _, kept, stated in two.live.plant.outbox(9)][1:] == [(event, text)]
 
 
 def test_what_happened_since_is_counted(two: Two) -> None:

@@ -63,6 +63,20 @@ PATTERNS = (
         "tests/plant/test_parcels.py",
     ),
     Pattern(
+        "a lifted ban does not come back with a backup",
+        "Merge._bans",
+        "self.live.policy.was_lifted(revocation.statement)",
+        "False",
+        "tests/backup/test_merge_rules.py",
+    ),
+    Pattern(
+        "removed trust does not come back with a backup",
+        "Merge._trust_ended",
+        "record.added <= self.distrusted.get((record.fingerprint, record.role), '')",
+        "False",
+        "tests/backup/test_merge_rules.py",
+    ),
+    Pattern(
         "exported evidence keeps its file whatever its number is now",
         "export",
         "next((path for path in same if holds(path, row.document)), None)",

@@ -314,6 +314,18 @@ class Plant:
         """Return the oldest events that wait for a page: number, id, JSON."""
         return self._store.execute("SELECT seq, id, event FROM outbox ORDER BY seq LIMIT ?", (most,))
 
+    def own_events(self) -> set[str]:
+        """Return the ids of every event that this station made: those that wait, and those on its pages."""
+        known = {event_id for (event_id,) in self._store.execute("SELECT id FROM outbox")}
+        chain = self.pages.chains().get(self._identity.fingerprint)
+        if chain is None:
+            return known
+        for number, hash, _ in self.pages.chain_links(chain.id):
+            page = self.pages.get(chain.id, number, hash)
+            events = json.loads(page.content).get("events", ()) if page is not None else ()
+            known |= {str(stated.get("id")) for stated in events if isinstance(stated, dict)}
+        return known
+
     def unsent(self) -> int:
         """Return how many events of this station the registry has not acknowledged.
 
