@@ -7,16 +7,18 @@ import hmac
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import PolicyError, StoreChangedError, WrongPassphraseError
+from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError, StoreChangedError, WrongPassphraseError
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise, rewrap
 from teds_provision.station.store.records import RevocationRecord, TrustRecord, WhitelistEntry
 from teds_provision.vault import passphrase
+from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.selection import forget_vaults
 
 NODE = bytes(range(10))
@@ -273,3 +275,49 @@ def test_a_changed_identity_key_is_not_handed_over(home: Path, opened: Open) -> 
     station.policy.trust(TrustRecord("east", "station", peer, fingerprint(peer)))
     with pytest.raises(PolicyError, match="pinned"):
         plan_export(station, ExportOrder(("east",), (NODE,), "copy"))
+
+
+def test_whose_master_keys_are_accepted(home: Path, opened: Open) -> None:
+    """Of a process that knows one that is in use here, or the key of the seals; what else opens it proves nothing."""
+    station = opened()
+    theirs = MasterKeys({1: b"t" * 32})
+    assert not station.accept_masters(theirs), "the vault is closed"
+    station.unlock()
+    here = station.vault.master_keys()
+    assert list(here.keys) == [1]
+    assert not station.accept_masters(theirs), "another key of the same number"
+    assert not station.accept_masters(MasterKeys({2: b"n" * 32})), "not the one that wraps here"
+    assert not station.accept_masters(MasterKeys({1: b"t" * 32, 2: b"n" * 32}))
+    both = MasterKeys({**here.keys, 2: b"n" * 32})
+    assert station.accept_masters(both)
+    assert station.vault.masters() == (1, 2)
+
+    record = station.identity.record()
+    assert record is not None
+    assert record.seal_key is not None
+    context = b"TEDS1 seal key\0" + station.id.encode()
+    key = station.vault.unwrap(record.seal_key, context=context)
+    evil, next_one = MasterKeys({7: b"e" * 32}), MasterKeys({7: b"m" * 32})
+    station.identity.put(replace(record, master=7, seal_key=evil.wrap(bytes(32), context=context)))
+    assert not station.accept_masters(evil), "it opens a key that another program put there"
+    station.identity.put(replace(record, master=7, seal_key=next_one.wrap(key, context=context)))
+    assert not station.accept_masters(evil)
+    assert station.accept_masters(next_one)
+
+
+def test_a_ca_key_that_is_not_the_owners_certifies_nobody(home: Path, opened: Open) -> None:
+    station = opened()
+    record = station.identity.record()
+    assert record is not None
+    station.unlock()
+    station.identity.put(replace(record, ca=OTHER))
+    with pytest.raises(NotFoundError, match="The CA key is not in this vault"):
+        station.identity.certify(POINT)
+    station.identity.put(record)
+    signature = station.identity.certify(POINT)
+    station.identity.keep_certificate(station.ca, POINT, signature)
+    station.identity.put_certificate(fingerprint(station.ca), fingerprint(POINT), b"kept before".ljust(64))
+    station.identity.keep_certificate(station.ca, POINT, signature)
+    assert station.identity.certificate(station.ca, POINT) == b"kept before".ljust(64), "the first one stays"
+    with pytest.raises(NotAuthenticError, match="did not sign the station"):
+        station.identity.keep_certificate(OTHER, POINT, signature)
