@@ -5,6 +5,98 @@ from __future__ import annotations
 from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
+    # stores, vaults, handovers and registries: whose word counts, and clocks that were ahead
+    Pattern(
+        "a statement is held against the key that a bundle brings",
+        "_key_of",
+        "pinned or brought",
+        "pinned",
+        "tests/handover/test_importing.py",
+    ),
+    Pattern(
+        "a certificate gives authority over known nodes alone",
+        "_has_authority",
+        "known and point is not None and (station.identity.certificate(station.keys.ca_of(uuid), point) is not None)",
+        "point is not None and station.identity.certificate(station.keys.ca_of(uuid), point) is not None",
+        "tests/handover/test_importing.py",
+    ),
+    Pattern(
+        "among members a keeper's ban counts and no other's",
+        "_has_authority",
+        "roster.has(signer, 'keeper')",
+        "roster.member(signer) is not None",
+        "tests/plant/test_contract_states.py",
+    ),
+    Pattern(
+        "no key that was refused is published as given",
+        "_handed",
+        "digits not in refused_by.get(peer, ())",
+        "True",
+        "tests/plant/test_backlog.py",
+    ),
+    Pattern(
+        "own agreements alone are published as agreed",
+        "backlog",
+        "record.source == 'agreement' and is_whole(pinned)",
+        "is_whole(pinned)",
+        "tests/plant/test_backlog.py",
+    ),
+    Pattern(
+        "a removal that a clock ahead took in is known since its roster",
+        "_first_removals",
+        "at if at <= now else created",
+        "at",
+        "tests/plant/test_removed_rules.py",
+    ),
+    Pattern(
+        "a sync that is dated ahead is late",
+        "registry",
+        "abs(now - synced) > _LATE",
+        "now - synced > _LATE",
+        "tests/plant/test_contract_states.py",
+    ),
+    Pattern(
+        "a backup that is dated ahead is told",
+        "_backups",
+        "days < -1",
+        "False",
+        "tests/doctor/test_doctor.py",
+    ),
+    Pattern(
+        "as a CA a key sends no bundles",
+        "Policy.station_points",
+        "self.trusted('station')",
+        "self.trusted()",
+        "tests/handover/test_importing.py",
+    ),
+    Pattern(
+        "master keys open the very key of the seals",
+        "StationIdentity.opened_by",
+        "self._row_macs.is_key(key)",
+        "True",
+        "tests/station/test_seals.py",
+    ),
+    Pattern(
+        "after a restore keys without proof are rotated, too",
+        "_demand_rotations",
+        "{record.uuid for record in keys.all()}",
+        "{record.uuid for record in keys.all() if record.state == 'active'}",
+        "tests/backup/test_whose_backup.py",
+    ),
+    Pattern(
+        "a corrected epoch is wrapped under the master key of now",
+        "NodeKeys.correct_epoch",
+        "self.refresh()",
+        "None",
+        "tests/station/test_key_marks.py",
+    ),
+    Pattern(
+        "a backup never names the module of its token",
+        "keystore_for",
+        "None if content.in_token or content.keystore in ('keyring', 'pkcs11') else content.keystore",
+        "content.keystore",
+        "tests/backup/test_whose_backup.py",
+    ),
     # clocks that were wrong for a while, places that changed, backups that are merged
     Pattern(
         "a request of a clock that was ahead is made anew",

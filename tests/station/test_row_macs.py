@@ -191,3 +191,16 @@ def test_the_mac_of_a_row_is_hmac_over_its_kind_and_values(length: int) -> None:
         assert macs.mac("kind", (value, None, b"\x07")) == expected
     assert macs.is_key(key)
     assert not macs.is_key(bytes(KEY_OCTETS))
+
+
+def test_with_a_closed_vault_a_row_counts_and_holds_for_nobody() -> None:
+    """Lists ask for no passphrase; what decides opens the vault first."""
+    macs = RowMacs(lambda: pytest.fail("the vault is not asked"))
+    assert not macs.active
+    assert [macs.counts(mac, "kind", ("x",)) for mac in (None, b"", bytes(16))] == [True, True, True]
+    assert not macs.is_key(bytes(32))
+    macs.use(bytes(32))
+    right = macs.mac("kind", ("x",))
+    assert [macs.counts(mac, "kind", ("x",)) for mac in (None, b"", bytes(16), right)] == [False, False, False, True]
+    assert [macs.holds(mac, "kind", ("x",)) for mac in (None, right, right[:8])] == [False, True, False]
+    assert not macs.counts(right, "another kind", ("x",))
