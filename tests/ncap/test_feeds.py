@@ -25,7 +25,8 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.events: list[str] = []
-        station: Any = SimpleNamespace(home=folder, audit=lambda *_words, **_facts: None)
+        self.log: list[tuple[Any, ...]] = []
+        station: Any = SimpleNamespace(home=folder, audit=lambda *words, **facts: self.log.append((*words, facts)))
         live: Any = SimpleNamespace(event=lambda _kind, **facts: self.events.append(facts["state"]))
         self.virtuals = Virtuals(station, live)
 
@@ -44,6 +45,7 @@ def test_a_transducer_has_one_simulation_and_the_end_of_an_earlier_one_is_not_th
 ) -> None:
     one, first, second = bench.made(ONE, "hand", tmp_path), Feed("page", lambda: None), Feed("api:sim", lambda: None)
     bench.virtuals.begin_feed(one, first)
+    first.lines, first.skipped = 7, 2
     with pytest.raises(NodeBusyError, match="already fed by page"):
         bench.virtuals.begin_feed(one, second)
     bench.virtuals.end_feed(one, first)
@@ -53,6 +55,10 @@ def test_a_transducer_has_one_simulation_and_the_end_of_an_earlier_one_is_not_th
     bench.virtuals.end_feed(one, second)
     assert one.feed is None
     assert bench.events == ["fed", "not fed", "fed", "not fed", "not fed"]
+    begun, ended = ("virtual", bytes.fromhex(ONE), "simulation connected"), ("virtual", bytes.fromhex(ONE))
+    assert bench.log[0] == (*begun, {"by": "page"})
+    assert bench.log[1] == (*ended, "simulation disconnected", {"by": "page", "lines": 7, "skipped": 2})
+    assert [entry[2] for entry in bench.log].count("simulation connected") == 2
     with pytest.raises(UsageError, match="has the source noise"):
         bench.virtuals.begin_feed(bench.made(OTHER, "foot", tmp_path, "noise"), first)
 

@@ -10,12 +10,21 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import BadDataError, NodeRefusedError, NotFoundError, UsageError
+from teds_provision.errors import (
+    BadDataError,
+    NodeRefusedError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
+    UsageError,
+)
 from teds_provision.ncap.nodes import provisioning
 from teds_provision.ncap.nodes.node_jobs import NodeJobs
 from teds_provision.ncap.nodes.provisioning import NEXT, AutoProvisioner, Provisioning, ProvisioningRun
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.station.store.audit import ACTOR, acting_for
 from tests.pace import until
 
 NODE, OTHER = "ab" * 10, "cd" * 10
@@ -120,6 +129,76 @@ def test_a_node_that_takes_a_key_at_a_reader_alone_begins_there_from_the_start(
     assert (run.state, cleaned) == ("failed", [True, True])
 
 
+@pytest.mark.parametrize("uuid", [NODE, NEXT])
+def test_what_was_asked_for_is_what_is_built(desk: Desk, monkeypatch: pytest.MonkeyPatch, uuid: str) -> None:
+    """It is built before the tap and at the tap; the log has who asked, whichever thread works then."""
+    orders, known, actors = list[Any](), list[Any](), list[str | None]()
+    desk.runs._trusted = (Path("lab.pem"),)
+
+    def prepare(_station: Any, order: Any, uuid: bytes | None) -> None:
+        orders.append(order)
+        known.append(uuid)
+
+    def provision(_station: Any, _node: Any, order: Any, **more: Any) -> Any:
+        orders.append(order)
+        actors.append(ACTOR.get())
+        more["reporter"].started("sign")
+        more["reporter"].finished(SimpleNamespace(name="sign", result="done", detail="sequence 2"))
+        return SimpleNamespace(verified=SimpleNamespace(verdict="authentic"))
+
+    monkeypatch.setattr(provisioning, "prepare", prepare)
+    monkeypatch.setattr(provisioning, "provision", provision)
+    more = {"name": "left", "channel": 2, "item": "r1", "adopt": True, "accept": "new cell"}
+    with acting_for("robot 7"):
+        desk.runs.begin(uuid, **ORDER | more)
+    assert ACTOR.get() != "robot 7"
+    assert desk.tap(NODE)
+    assert actors == ["robot 7"]
+    assert known == [bytes.fromhex(NODE) if uuid == NODE else None]
+    for order in orders:
+        path = order.calibration
+        assert path.name == "calibration.csv"
+        assert order == BuildOrder(
+            profile="gripper", name="left", calibration=path, channel=2, item="r1", adopt=True,
+            accept_calibration="new cell", trusted=(Path("lab.pem"),),
+        )  # fmt: skip
+    assert desk.runs.run_of(NODE) == {
+        "uuid": NODE, "state": "done", "waits_for": None, "until": None, "error": None, "verdict": "authentic",
+        "steps": [{"name": "sign", "result": "done", "detail": "sequence 2"}],
+    }  # fmt: skip
+
+
+def test_a_run_whose_node_is_not_authentic_at_the_end_has_failed(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_verified: Any) -> None:
+        raise NotAuthenticError("Its signature is not good.")
+
+    monkeypatch.setattr(provisioning, "require_authentic", refuse)
+    desk.runs.begin(NODE, **ORDER)
+    assert desk.tap(NODE)
+    until(lambda: desk.state(NODE) == "failed")
+    run = desk.runs.run_of(NODE)
+    assert (run["verdict"], run["waits_for"], run["until"]) == ("authentic", None, None)
+    assert run["error"]["message"] == "Its signature is not good."
+    assert desk.course[-1] == ("ab", "failed")
+
+
+def test_a_node_that_is_being_provisioned_is_not_begun_again_and_one_that_never_came_is_waited_for_no_more(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.runs._runs[OTHER] = ProvisioningRun(OTHER)
+    with pytest.raises(UsageError, match="already being provisioned"):
+        desk.runs.begin(OTHER, **ORDER)
+    monkeypatch.setattr(provisioning, "WAITING", 0.0)
+    desk.runs.begin(NODE, **ORDER)
+    until(lambda: desk.state(NODE) == "failed")
+    run = desk.runs.run_of(NODE)
+    assert (run["waits_for"], run["until"], run["error"]["code"]) == (None, None, "no-node")
+    assert not desk.tap(NODE), "nothing waits any more"
+    monkeypatch.setattr(provisioning, "WAITING", 60.0)
+    desk.runs.begin(NODE, **ORDER)
+    assert desk.tap(NODE)
+
+
 class Auto(AutoProvisioner):
     """Takes up every permitted node; a board's own datasheet is signed at once."""
 
@@ -137,6 +216,8 @@ class Auto(AutoProvisioner):
         ({"wired": False}, False),
         ({"moved": True}, False),
         ({"state": NodeState.PROVISIONED}, False),
+        ({"listed": 256}, True),
+        ({"new": True}, True),
     ],
 )
 def test_a_factory_node_of_a_wired_bus_is_adopted_unless_it_was_given_away(
@@ -152,9 +233,17 @@ def test_a_factory_node_of_a_wired_bus_is_adopted_unless_it_was_given_away(
     policy = SimpleNamespace(tombstone=lambda _uuid: object() if change.get("moved") else None)
     station = SimpleNamespace(policy=policy, node_lock=locked, audit=lambda act, *_words, **_facts: done.append(act))
     auto = Auto(station, SimpleNamespace(event=lambda _kind, **facts: done.append(facts["state"])))
-    who = SimpleNamespace(whitelisted=object(), fingerprint="f")
-    for name, found in (("identify", who), ("list_blocks", []), ("agree", SimpleNamespace(epoch=1))):
+    who = SimpleNamespace(whitelisted=None if change.get("new") else object(), fingerprint="f")
+    newcomers: list[Any] = []
+
+    def agree(*_words: Any, newcomer: Any) -> Any:
+        newcomers.append(newcomer)
+        return SimpleNamespace(epoch=1)
+
+    for name, found in (("identify", who), ("list_blocks", [None] * change.get("listed", 5))):
         monkeypatch.setattr(provisioning, name, lambda *_words, found=found, **_more: found)
+    monkeypatch.setattr(provisioning, "agree", agree)
+    monkeypatch.setattr(provisioning, "new_whitelist_entry", lambda *_words: "its entry")
     monkeypatch.setattr(provisioning, "replace", lambda identity, **facts: SimpleNamespace(**vars(identity) | facts))
     monkeypatch.setattr(auto, "_sign_own", lambda node: node.identity.state == NodeState.KEYED)
     capabilities = SimpleNamespace(wired=change.get("wired", True))
@@ -166,14 +255,18 @@ def test_a_factory_node_of_a_wired_bus_is_adopted_unless_it_was_given_away(
     )
     assert auto.serve(node) is adopted
     assert done == (["adopt", "adopted"] if adopted else [])
+    assert newcomers == (["its entry" if change.get("new") else None] if adopted else [])
 
 
-def test_a_datasheet_that_was_refused_is_tried_again_once_its_node_was_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [BadDataError("It has no unit."), PolicyError("Another node has its name.")])
+def test_a_datasheet_that_was_refused_is_tried_again_once_its_node_was_reset(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tried, events = list[bool](), list[str]()
 
     def provision(*_words: Any, **_more: Any) -> Any:
         tried.append(True)
-        raise BadDataError("It has no unit.")
+        raise error
 
     monkeypatch.setattr(provisioning, "provision", provision)
     policy = SimpleNamespace(tombstone=lambda _uuid: object())
@@ -198,8 +291,122 @@ def test_a_datasheet_that_was_refused_is_tried_again_once_its_node_was_reset(mon
 
 
 @pytest.mark.parametrize(
-    ("name", "file"), [(None, "calibration.csv"), ("Cell.CSV", "calibration.csv"), ("a.b.Json", "calibration.json")]
+    ("change", "signed"),
+    [
+        ({}, True),
+        ({"signs": False}, False),
+        ({"adopts": False}, False),
+        ({"virtual": True}, False),
+        ({"wired": False}, False),
+        ({"tapped": True}, False),
+        ({"held": False}, False),
+        ({"pinned": False}, False),
+        ({"state": NodeState.PROVISIONED}, False),
+    ],
 )
+def test_with_yes_the_own_datasheet_of_a_node_that_this_station_keyed_on_a_wire_is_signed(
+    change: dict[str, Any], signed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def is_so(word: str) -> bool:
+        return bool(change.get(word, True))
+
+    done: list[Any] = []
+    station: Any = SimpleNamespace(
+        keys=SimpleNamespace(held=lambda _uuid: is_so("held")),
+        pins=SimpleNamespace(entry=lambda _uuid: object() if is_so("pinned") else None),
+    )
+    virtuals: Any = {NODE: None} if change.get("virtual") else {}
+    none: Any = None
+    auto = AutoProvisioner(station, none, none, virtuals, lambda: is_so("adopts"), signs=is_so("signs"))
+
+    def provision(_station: Any, _node: Any, order: Any, **_more: Any) -> Any:
+        done.append(order)
+        return SimpleNamespace(verified="verified")
+
+    monkeypatch.setattr(provisioning, "provision", provision)
+    monkeypatch.setattr(provisioning, "_show_verified", lambda _directory, *shown: done.append(shown))
+    capabilities = SimpleNamespace(wired=is_so("wired"))
+    node: Any = SimpleNamespace(
+        uuid=bytes.fromhex(NODE),
+        tapped=change.get("tapped", False),
+        identity=SimpleNamespace(state=change.get("state", NodeState.KEYED)),
+        contact=SimpleNamespace(link=SimpleNamespace(capabilities=capabilities)),
+    )
+    assert auto.serve(node) is signed
+    assert done == ([BuildOrder(adopt=True), (NODE, "verified")] if signed else [])
+
+
+def test_a_node_of_more_teds_than_a_stranger_may_have_is_not_adopted(monkeypatch: pytest.MonkeyPatch) -> None:
+    none: Any = None
+    auto = Auto(SimpleNamespace(policy=SimpleNamespace(tombstone=lambda _uuid: None)), none)
+    monkeypatch.setattr(provisioning, "identify", lambda *_words: None)
+    monkeypatch.setattr(provisioning, "list_blocks", lambda _node: [None] * 257)
+    contact = SimpleNamespace(link=SimpleNamespace(capabilities=SimpleNamespace(wired=True)))
+    identity = SimpleNamespace(state=NodeState.FACTORY)
+    node: Any = SimpleNamespace(uuid=bytes.fromhex(NODE), tapped=False, identity=identity, contact=contact)
+    with pytest.raises(BadDataError, match="lists 257 TEDS; one with more than 256 is not adopted"):
+        auto.serve(node)
+
+
+@pytest.mark.parametrize("profile", ["gripper", None])
+def test_a_virtual_transducer_gets_what_it_was_made_of(profile: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[Any] = []
+
+    class Made(dict[str, None]):
+        """The one transducer of the station."""
+
+        def profile_of(self, _uuid: str) -> str | None:
+            return profile
+
+        def calibration_of(self, _uuid: str) -> Path:
+            return Path("calibration.toml")
+
+        def name_of(self, _uuid: str) -> str:
+            return "hand"
+
+        def blocks_of(self, uuid: str) -> dict[str, str]:
+            return {"of": uuid}
+
+    @contextmanager
+    def locked(_uuid: bytes) -> Iterator[None]:
+        course.append("locked")
+        yield
+
+    def provision(_station: Any, _node: Any, order: Any, **_more: Any) -> Any:
+        course.append(order)
+        return SimpleNamespace(verified="verified")
+
+    def write_sheet(_station: Any, _node: Any, blocks: Any, _reporter: Any) -> Any:
+        course.append(blocks)
+        return SimpleNamespace(verified="verified")
+
+    nodes = SimpleNamespace(remember=lambda uuid, **facts: course.append((uuid, facts)))
+    none: Any = None
+    station: Any = SimpleNamespace(node_lock=locked, nodes=nodes)
+    made: Any = Made({NODE: None})
+    auto = AutoProvisioner(station, none, none, made, lambda: False)
+    monkeypatch.setattr(provisioning, "provision", provision)
+    monkeypatch.setattr(provisioning, "write_sheet", write_sheet)
+    monkeypatch.setattr(provisioning, "identify", lambda *_words: "who")
+    monkeypatch.setattr(provisioning, "agree", lambda _station, _node, who: course.append(who))
+    monkeypatch.setattr(provisioning, "_show_verified", lambda _directory, *shown: course.append(shown))
+    identity = SimpleNamespace(state=NodeState.FACTORY)
+    node: Any = SimpleNamespace(uuid=bytes.fromhex(NODE), tapped=False, identity=identity)
+    assert auto.serve(node)
+    if profile is not None:
+        assert course[:-1] == [BuildOrder("gripper", calibration=Path("calibration.toml"), name="hand")]
+    else:
+        assert course[:-1] == ["locked", "who", {"of": NODE}, (bytes.fromhex(NODE), {"name": "hand"})]
+    assert course[-1] == (NODE, "verified")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        (None, "calibration.csv"), ("Cell.CSV", "calibration.csv"), ("a.b.Json", "calibration.json"),
+        ("x.toml", "calibration.toml"), ("x.txt", "calibration.txt"), ("dcc.xml", "calibration.xml"),
+    ],
+)  # fmt: skip
 def test_a_calibration_is_of_the_form_that_its_name_ends_in(tmp_path: Path, name: str | None, file: str) -> None:
     made = provisioning._file(tmp_path, "raw,value\n", name)
     assert made == tmp_path / file

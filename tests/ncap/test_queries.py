@@ -12,7 +12,15 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, TedsProvisionError, UsageError
+from teds_provision.errors import (
+    FrozenError,
+    NodeBusyError,
+    NotFoundError,
+    PolicyError,
+    StoreError,
+    TedsProvisionError,
+    UsageError,
+)
 from teds_provision.ncap.nodes.update_actions import UpdateRequest
 from teds_provision.ncap.web import app, clause12, metrics, resources
 from teds_provision.ncap.web.clause12 import Clause12
@@ -155,6 +163,59 @@ def test_names_of_clause_12_are_separated_by_commas_alone_and_a_module_keeps_its
     for word in ("", "-1", "65536", "x"):
         with pytest.raises(UsageError, match="channelId must be a number"):
             clause12._integer({"channelid": word}, "channelId")
+
+
+@pytest.mark.parametrize(
+    ("path", "query", "kind", "body"),
+    [
+        ("Discovery/TIMDiscovery", "", "xml", "<errorCode>0</errorCode><timIds>1</timIds><uuids>aa</uuids>"),
+        ("discovery/timdiscovery.htm", "format=1", "xml", "<timIds>1</timIds>"),
+        ("Discovery/TIMDiscovery", "format=0", "text", "0\n1\naa\n"),
+        ("Discovery/TIMDiscovery", "responseFormat=TEXT&format=1", "text", "0\n1\naa\n"),
+        ("Discovery/TIMDiscovery", "ResponseFormat=json", "json", '{"errorCode":0,"timIds":"1","uuids":"aa"}'),
+        ("TransducerAccess/ReadData", "timId=1&channelId=1", "xml", "<timId>1</timId><channelId>1</channelId>"
+         "<transducerData>2.5</transducerData><timestamp>7.0</timestamp>"),
+        ("TransducerAccess/ReadData", "timId=1&channelId=2&format=0", "text", "2\n1\n2\n\n"),
+        ("TransducerAccess/ReadData", "timId=1&channelId=3&format=0", "text", "2\n1\n3\n\n"),
+        ("TransducerAccess/ReadData", "timId=1&channelId=9&format=0", "text", "1\nNode aa has no channel 9.\n"),
+        ("TransducerAccess/ReadData", "timId=7&channelId=1&format=0", "text", "1\nNo node matches 7.\n"),
+        ("TransducerAccess/ReadData", "timId=1&format=0", "text", "3\nchannelId must be a number.\n"),
+        ("TEDSManager/ReadTeds", "timId=1&tedsType=1&format=0", "text", '0\n1\n0\n1\n{"UUID": "aa"}\n'),
+        ("TEDSManager/ReadTeds", "timId=1&channelId=1&tedsType=3&format=0", "text", '0\n1\n1\n3\n{"Unit": "°"}\n'),
+        ("TEDSManager/ReadTeds", "timId=1&tedsType=3&format=0", "text", "1\nNode aa has no TEDS 3 of channel 0.\n"),
+        ("TEDSManager/ReadRawTeds", "timId=1&tedsType=1&format=0", "text", "4\nThe node is busy.\n"),
+    ],
+)  # fmt: skip
+def test_the_answers_of_clause_12(path: str, query: str, kind: str, body: str) -> None:
+    def known(word: str) -> str:
+        raise NotFoundError(f"No node matches {word}.")
+
+    def busy(_uuid: str) -> None:
+        raise NodeBusyError("The node is busy.")
+
+    values = {1: SimpleNamespace(value=2.5, time=7.0), 2: SimpleNamespace(value=None, time=7.0)}
+    teds = [
+        {"channel": None, "access_code": 1, "fields": [{"name": "UUID", "text": "aa"}]},
+        {"channel": 1, "access_code": 3, "fields": [{"name": "Unit", "text": "°"}]},
+    ]
+    daemon: Any = SimpleNamespace(
+        known=known,
+        directory=SimpleNamespace(
+            uuids=lambda: ["aa"],
+            seen=lambda _uuid: SimpleNamespace(present=True),
+            channel_names=lambda _uuid: [(number, "") for number in (1, 2, 3)],
+        ),
+        live=SimpleNamespace(last=lambda _uuid, channel: values.get(channel)),
+        sheets=SimpleNamespace(as_json=lambda _uuid: ({"teds": teds}, "digest"), read=busy),
+    )
+    asked = request(query)
+    asked.scope["path_params"] = {"path": path}
+    answer = asyncio.run(Clause12(daemon)._answer(asked))
+    assert (answer.status_code, answer.media_type) == (200, {
+        "xml": "application/xml", "text": "text/plain", "json": "application/json",
+    }[kind])  # fmt: skip
+    text = bytes(answer.body).decode()
+    assert body in text if kind == "xml" else text == body
 
 
 @pytest.mark.parametrize("read_only", [False, True])

@@ -69,6 +69,73 @@ def test_a_measured_nodes_datasheet_is_that_of_its_session_one_on_a_bus_is_read_
         desk.sheets.read(NODE)
 
 
+@pytest.mark.parametrize(("keyed", "why"), [(True, "it opens no session under our key"), (False, "")])
+def test_a_node_that_opens_no_session_is_read_and_judged_by_what_it_sends_plainly(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, keyed: bool, why: str
+) -> None:
+    identified, checked = list[bytes](), list[tuple[str, str]]()
+
+    def check(*words: str) -> str:
+        checked.append(words)  # type: ignore[arg-type]
+        return "session"
+
+    desk.on_bus = True
+    monkeypatch.setattr(sheets, "read_anew", lambda _station, _node: None)
+    monkeypatch.setattr(sheets, "identify", lambda _station, node: identified.append(node.uuid))
+    monkeypatch.setattr(sheets, "read_image", lambda _node: READ)
+    monkeypatch.setattr(sheets, "is_keyed", lambda _station, _uuid: keyed)
+    monkeypatch.setattr(sheets, "freshness_floor_of", lambda _station, _uuid, identity: ("floor", identity))
+    monkeypatch.setattr(sheets, "verify_image", lambda _station, image, floor: (image, floor))
+    monkeypatch.setattr(sheets, "session_check", check)
+    found = desk.sheets.read(NODE)
+    assert identified == [bytes.fromhex(NODE)], "it proves its key, which is held against the pin"
+    assert (found.image, found.now, found.judged.origin, found.judged.by) == (READ, True, "plain", "ncap")
+    assert found.judged.verified.checks == (READ, ("floor", None), "session")
+    assert checked == [("", why)]
+
+
+def test_what_the_guard_says_of_a_datasheet_is_shown_as_a_warning_or_if_it_refuses_as_an_error(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def guard(_station: Any, image: Image, *_words: Any, record: bool) -> list[str]:
+        assert not record
+        if image is HELD:
+            raise BadDataError("It falls.", hint="Turn it round.")
+        return ["It is old."]
+
+    monkeypatch.setattr(sheets, "guard", guard)
+    assert desk.sheets._guarded(KEPT) == [{"severity": "warning", "message": "It is old.", "hint": ""}]
+    assert desk.sheets._guarded(HELD) == [{"severity": "error", "message": "It falls.", "hint": "Turn it round."}]
+
+
+def test_a_plan_has_each_change_and_the_tag_of_the_datasheet_that_it_would_change(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    facts = {"channel": 1, "access_code": 3, "field": "UpLimit", "before": "1", "after": "2", "text": "1 -> 2"}
+    plan = SimpleNamespace(
+        changes=[SimpleNamespace(**facts)], warnings=["It is wide."], present=SimpleNamespace(image=READ)
+    )
+    asked: list[Any] = []
+
+    def planned(_station: Any, _node: Any, blocks: Any, **words: Any) -> Any:
+        asked.append((blocks, words))
+        return plan
+
+    monkeypatch.setattr(sheets, "plan_sheet", planned)
+    monkeypatch.setattr(sheets, "parsed", lambda content: {"parsed": content})
+    words = {"accept": "new cell", "retype": True, "expected": frozenset({"aa"})}
+    assert desk.sheets.plan(NODE, "<teds/>", **cast(Any, words)) == (
+        {
+            "uuid": NODE, "dry_run": True, "changes": [facts], "steps": [], "verdict": None,
+            "guard": [{"severity": "warning", "message": "It is wide.", "hint": ""}],
+        },
+        READ.digest(),
+    )  # fmt: skip
+    given = {"accept_calibration": "new cell", "retype": True, "expected": frozenset({"aa"})}
+    assert asked == [({"parsed": "<teds/>"}, given)]
+    assert desk.course == ["a datasheet is compared"], "nothing is shown anew"
+
+
 def test_after_a_write_the_new_datasheet_is_shown_and_the_problem_is_over(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,8 +143,14 @@ def test_after_a_write_the_new_datasheet_is_shown_and_the_problem_is_over(
     step = SimpleNamespace(name="write", result="done", seconds=0.1, detail="")
     plan = SimpleNamespace(changes=[], warnings=["w"])
     done = SimpleNamespace(steps=[step], plan=plan, verified=SimpleNamespace(verdict="authentic"))
-    monkeypatch.setattr(sheets, "write_sheet", lambda *_words, **_more: done)
-    monkeypatch.setattr(sheets, "parsed", lambda _content: {})
+    words: dict[str, Any] = {}
+
+    def write_sheet(_station: Any, _node: Any, blocks: Any, _reporter: Any, **more: Any) -> Any:
+        words.update(more, blocks=blocks)
+        return done
+
+    monkeypatch.setattr(sheets, "write_sheet", write_sheet)
+    monkeypatch.setattr(sheets, "parsed", lambda content: {"parsed": content})
 
     class Lock:
         def __enter__(self) -> None:
@@ -87,7 +160,10 @@ def test_after_a_write_the_new_datasheet_is_shown_and_the_problem_is_over(
             desk.course.append("node free")
 
     cast(Any, desk.sheets._station).node_lock = lambda _uuid: Lock()
-    shown = desk.sheets.write(NODE, "<teds/>")
+    shown = desk.sheets.write(NODE, "<teds/>", accept="new cell", retype=True, expected=frozenset({"aa"}))
+    assert words == {
+        "blocks": {"parsed": "<teds/>"}, "accept_calibration": "new cell", "retype": True, "expected": {"aa"},
+    }  # fmt: skip
     assert (shown["uuid"], shown["dry_run"], shown["verdict"], shown["guard"][0]["message"]) == (
         NODE, False, "authentic", "w",
     )  # fmt: skip
