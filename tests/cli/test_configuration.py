@@ -15,7 +15,7 @@ from typing import Any
 import click
 import pytest
 
-from teds_provision.cli.config_file import Defaults, anchored, brokers_of
+from teds_provision.cli.config_file import Defaults, anchored, brokers_of, home_of, problems
 from teds_provision.cli.main import cli, run
 from teds_provision.cli.station.config import _edited
 
@@ -374,3 +374,44 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
         },
     }
     assert anchored(anchored(settings, folder), Path("/elsewhere")) == anchored(settings, folder)
+
+
+@pytest.mark.parametrize(
+    ("values", "text", "found"),
+    [
+        ({"dry_run": True, "export_keys": {"all": True}, "whitelist": {"dry-run": True}}, "", []),
+        ({"whitelist": {"add": {"name": "x"}}, "ncap": {"brokers": {"any_name": "mqtt://h"}}}, "", []),
+        ({"home": "/x"}, "home = '/x'", ["line 1: no command has an option --home."]),
+        ({"passphrase-fd": 3}, "\n\npassphrase-fd = 3", ["line 3: no command has an option --passphrase-fd."]),
+        (
+            {"sign": {"jump": True}},  # signer once has one
+            "[sign]\njump = true",
+            ["line 2: sign has no option --jump."],
+        ),
+        ({"whitelist": {"watch": True}}, "[whitelist]\nwatch = true", ["line 2: whitelist has no option --watch."]),
+        ({"whitelist": {"add": {"watch": 1}}}, "[whitelist.add]\nwatch = 1", [
+            "line 2: whitelist add has no option --watch."]),
+        ({"whitelist": {"ad": {}}}, "[whitelist.ad]", ["line 1: there is no command 'whitelist ad'."]),
+        ({"provison": {}}, "# provison\nname = 'provison'\n[ provison ]", [
+            "line 3: there is no command 'provison'. Did you mean 'provision'?"]),
+        ({"ncap": {"brokers": {"lab": 7}}}, "[ncap.brokers]\nlab = 7", [
+            'line 2: a broker is named with its URL: lab = "mqtts://HOST".']),
+        ({"profil": "x", "watsh": 1}, "profil = 'x'\n'watsh' = 1", [
+            "line 1: no command has an option --profil. Did you mean 'profile'?",
+            "line 2: no command has an option --watsh. Did you mean 'watch'?",
+        ]),
+        ({"a" * 50: 1}, "", [f"line 1: no command has an option --{'a' * 40}."]),
+    ],
+)  # fmt: skip
+def test_each_name_that_no_command_knows_is_a_problem_with_its_line(
+    values: dict[str, Any], text: str, found: list[str]
+) -> None:
+    said = list(problems(values, text))
+    assert len(said) == len(found)
+    assert all(problem.startswith(start) for problem, start in zip(said, found, strict=True)), said
+
+
+def test_a_home_may_be_named_from_that_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/users/ada")
+    assert home_of(Path("~/bench")) == Path("/users/ada/bench")
+    assert home_of(Path("bench")) == Path("bench")
