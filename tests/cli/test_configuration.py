@@ -415,3 +415,32 @@ def test_a_home_may_be_named_from_that_of_the_user(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("HOME", "/users/ada")
     assert home_of(Path("~/bench")) == Path("/users/ada/bench")
     assert home_of(Path("bench")) == Path("bench")
+
+
+def test_a_value_is_checked_as_its_own_command_takes_it(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert call(home, "--json", "config", "path").json["exists"] is False
+    (home / "config.toml").write_text('[ncap.run]\nble = ["hci0", "hci1"]\nrate = 5\n[update]\nparallel = 24\n')
+    done = call(home, "--json", "config", "show")
+    assert done.code == 0, done
+    assert [(row["name"], row["value"]) for row in done.json["settings"][1:]] == [
+        ("ncap.run.ble", ["hci0", "hci1"]), ("ncap.run.rate", 5), ("update.parallel", 24),
+    ]  # fmt: skip
+    assert done.err == ""
+    for text, message in (
+        ('[provision]\nble = ["hci0", "hci1"]\n', "provision.ble takes one value, not 2."),
+        ("[update]\nparallel = 25\n", "update.parallel = 25: 25 is not in the range 1<=x<=24."),
+        ("[update]\nwait = 0\n", "update.wait = 0: 0.0 is not in the range 1<=x<=3600."),
+    ):
+        (home / "config.toml").write_text(text)
+        refused = call(home, "--json", "config", "show")
+        assert refused.code == 8
+        assert refused.json["error"]["message"].endswith(f"config.toml: {message}"), refused
+    (home / "config.toml").unlink()
+    monkeypatch.setenv("TEDS_PROVISION_BITRATE", "5")
+    warned = call(home, "--json", "config", "show")
+    assert (warned.code, warned.err) == (
+        0, "Warning: TEDS_PROVISION_BITRATE is set, but no command has an option --bitrate.\n",
+    )  # fmt: skip
+    assert warned.json["settings"][1:] == [
+        {"name": "bitrate", "value": "5", "source": "environment (TEDS_PROVISION_BITRATE)"}
+    ]

@@ -21,11 +21,14 @@ from teds_provision.cli.terminal_operator import TerminalOperator
 from teds_provision.errors import NotWhitelistedError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
+from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.provisioning.batch_sheet import DeclinedError
 from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.build import UnrequestedChangeError
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Holder
+from teds_provision.teds.image import Image
 from tests.bench import PASSPHRASE
 from tests.parsed import parsed
 
@@ -261,6 +264,71 @@ def test_a_yes_to_the_differences_retypes_one_board_and_nothing_else_does(
     with pytest.raises(PolicyError, match="keeps its type"):
         operator.retype(WHO.uuid, tuple(differences))
     assert len(asked) == 2
+
+
+CHANGES: Any = tuple(SimpleNamespace(text=f"change {number}") for number in range(22))
+
+
+@pytest.mark.parametrize("yes", [False, True])
+def test_a_change_that_was_not_named_is_shown_and_asked_whatever_was_answered_already(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]], capsys: pytest.CaptureFixture[str], yes: bool
+) -> None:
+    for options in ({"no_input": True}, {"as_json": True}):
+        with pytest.raises(UnrequestedChangeError) as refused:
+            TerminalOperator(app(**options), yes=yes).confirm(WHO.uuid, CHANGES)
+        assert refused.value.changes == CHANGES
+        assert refused.value.message.endswith("would change: change 0 change 1 change 2 And 19 more.")
+    asked = typed("y", "n")
+    TerminalOperator(app(), yes=yes).confirm(WHO.uuid, CHANGES)
+    shown = capsys.readouterr().err.splitlines()
+    assert shown[0].startswith(f"Node {UUID} has a different datasheet.")
+    assert shown[1:] == [*(f"  change {number}" for number in range(20)), "  and 2 more"]
+    with pytest.raises(DeclinedError, match=f"Node {UUID} keeps its datasheet"):
+        TerminalOperator(app(), yes=yes).confirm(WHO.uuid, CHANGES[:20])
+    assert "more" not in capsys.readouterr().err.splitlines()[-1]
+    assert [question["question"] for question in asked] == ["Write it?"] * 2
+
+
+def test_a_datasheet_that_a_board_brought_is_shown_before_it_is_signed(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    brought: Any = FactoryDatasheet(Image(WHO.uuid, {}), "finger", (), ("It is overdue.",), ("It is old.",))
+    lines = [f"Node {UUID} brought its own datasheet: finger", "  error: It is overdue.", "  warning: It is old."]
+    for options in ({"no_input": True}, {"as_json": True}):
+        with pytest.raises(NotAdoptedError):
+            TerminalOperator(app(**options), yes=False).adopt(brought)
+    assert capsys.readouterr().err == ""
+    TerminalOperator(app(no_input=True), yes=True).adopt(brought)
+    assert capsys.readouterr().err.splitlines() == lines
+    asked = typed("y", "n")
+    TerminalOperator(app(), yes=True).adopt(brought)
+    assert asked == []
+    capsys.readouterr()
+    TerminalOperator(app(), yes=False).adopt(brought)
+    assert capsys.readouterr().err.splitlines() == lines
+    with pytest.raises(DeclinedError, match="was not signed"):
+        TerminalOperator(app(), yes=False).adopt(brought)
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("what", ["low_battery", "jump"])
+def test_a_low_battery_and_a_jump_are_asked_about_unless_yes_was_said(
+    app: Callable[..., App], typed: Callable[..., list[dict[str, Any]]], what: str
+) -> None:
+    def ask(**facts: Any) -> None:
+        yes = facts.pop("yes", False)
+        getattr(TerminalOperator(app(**facts), yes=yes), what)("Go on?")
+
+    with pytest.raises(PolicyError, match="there is no terminal to ask on"):
+        ask(no_input=True)
+    ask(no_input=True, yes=True)
+    asked = typed("y", "n")
+    ask(yes=True)
+    assert asked == []
+    ask()
+    with pytest.raises(PolicyError, match="Nothing was changed"):
+        ask()
+    assert [question["question"] for question in asked] == ["Go on?"] * 2
 
 
 # -- locks -------------------------------------------------------------------------------------------------------------
