@@ -16,6 +16,7 @@ from itertools import chain
 from statistics import median
 from typing import Any, Final
 
+from teds_provision.plant.apply_pages import counted_places
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.evidence import GOOD_RESULTS, PASSED, Evidence, read
 from teds_provision.protocol.plant.job import Job
@@ -122,10 +123,15 @@ def _of_requests(station: Station, job: str) -> Iterator[Attempt]:
 
 
 def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
-    """Yield the attempts that pages report, in their order, each with the SHA-256 of its evidence."""
-    counts = Counter[tuple[str, bytes]]()
+    """Yield the attempts that pages which count report, in their order, each with the SHA-256 of its evidence."""
+    roster, counts = station.plant.roster, Counter[tuple[str, bytes]]()
+    if roster is None:
+        return
     for name, pages in station.plant.pages.chains().items():
+        counted = counted_places(station, roster, pages)
         for page in station.plant.pages.each(pages.id):
+            if (page.n, page.hash) not in counted:
+                continue
             for value in json.loads(page.content).get("events", []):
                 stated = event.read(value)
                 if not isinstance(stated, event.Event) or stated.act != "evidence" or stated.uuid is None:
