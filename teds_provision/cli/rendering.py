@@ -61,6 +61,11 @@ def local_time(text: str) -> str:
         return text
 
 
+def time_for(app: App, text: str) -> str:
+    """Return a moment of the store as this run shows it: UTC with --json, else local time."""
+    return text if app.json else local_time(text)
+
+
 FIRMWARE_CHANGED = "firmware changed since calibration"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -235,6 +236,27 @@ def test_of_many_boards_each_has_a_line_and_the_sum_is_the_last(
             }
         ],
     )  # fmt: skip
+
+
+def test_each_result_and_error_of_many_boards_shows_its_time_to_people(
+    running: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """docs/batch.md: a result had none, and an error had that of Greenwich."""
+    monkeypatch.setenv("TZ", "Asia/Kolkata")
+    time.tzset()
+    try:
+        boards = [board(), board(OTHER, error=SILENT, row=2), board(THIRD, done=replace(DONE, verified=FORGED))]
+        boards = [replace(each, time="2026-11-28T01:02:03Z") for each in boards]
+        outcome, _ = running(Run(boards), "--watch", "--yes")
+        (one, _) = running(Run(boards[:1]))
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    at = "2026-11-28 06:32:03+05:30"
+    assert [line for line in outcome.out.splitlines() if line.startswith("time")] == [f"time       {at}"] * 2
+    assert f"Error ({OTHER.hex()}, {at}, row 2): It is silent.\n  → Put it back.\n" in outcome.err
+    assert f"Error ({THIRD.hex()}, {at}): " in outcome.err
+    assert "time  " not in one.out, "one board is here now"
 
 
 def test_the_sum_of_a_batch_for_people(running: Any) -> None:

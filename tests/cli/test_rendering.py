@@ -38,6 +38,7 @@ from teds_provision.cli.rendering import (
     print_json_list,
     shown,
     tidy,
+    time_for,
 )
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.links.ports import Notice
@@ -54,6 +55,13 @@ def berlin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 # -- moments -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("berlin")
+def test_a_moment_is_local_for_people_and_utc_for_programs() -> None:
+    for as_json, shown_at in ((False, "2026-06-10 14:00:00+02:00"), (True, "2026-06-10T12:00:00Z")):
+        app = cast("Any", SimpleNamespace(json=as_json))
+        assert time_for(app, "2026-06-10T12:00:00Z") == shown_at
 
 
 @pytest.mark.parametrize(

@@ -102,19 +102,6 @@ def test_one_link_that_is_typed_is_chosen_and_one_that_is_kept_is_not(
     assert links.ble == (AIR if "--ble" in typed else None)
 
 
-@pytest.mark.parametrize(
-    ("foxglove", "at", "address"),
-    [
-        (False, None, None),
-        (True, None, "127.0.0.1:8765"),
-        (True, "0.0.0.0:9", "0.0.0.0:9"),
-        (False, "[::]:9", "[::]:9"),
-    ],
-)
-def test_foxglove_serves_the_address_that_is_named_for_it(foxglove: bool, at: str | None, address: str | None) -> None:
-    assert options.foxglove_address(foxglove, at) == address
-
-
 def test_who_names_a_time_has_the_nodes_collected_for_so_long() -> None:
     """`--timeout` in config.toml is patience for a tap: it makes no identify of a bus wait for two minutes."""
     for kept, typed, seconds in (

@@ -11,7 +11,7 @@ import click
 from teds_provision import provisioning
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
-from teds_provision.cli.rendering import firmware_words, reporter_for
+from teds_provision.cli.rendering import firmware_words, reporter_for, time_for
 from teds_provision.errors import UsageError
 from teds_provision.links import LINKS, LinkSettings, Notice
 from teds_provision.protocol.announce import LAST_ADDRESS
@@ -56,7 +56,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bo
         dry_run=dry_run,
     ):
         if arrival.error is not None:
-            app.fail_line(arrival.error, uuid=arrival.uuid.hex(), time=arrival.time)
+            app.fail_line(arrival.error, uuid=arrival.uuid.hex(), time=time_for(app, arrival.time))
         elif arrival.result is not None:
             found.append(_to_json(arrival.result) | (_plan(arrival.result, add=add) if dry_run else {}))
             if watch:

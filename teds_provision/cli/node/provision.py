@@ -18,7 +18,7 @@ from teds_provision import firmware_image, provisioning, teds
 from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.node.build import calibration_json, order_options
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, options_given, yes_option
-from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
+from teds_provision.cli.rendering import firmware_words, local_time, print_table, reporter_for, time_for
 from teds_provision.errors import TedsProvisionError, UsageError, WrongImageError
 from teds_provision.firmware_image import FirmwareImage
 from teds_provision.lazy import late
@@ -301,9 +301,9 @@ def _print_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any
         seconds = round(board.seconds, 3)
         _print_result(app, board.done, warn=warn, row=board.row, time=board.time, seconds=seconds, **line)
         if board.failure is not None and not app.json:
-            app.fail_line(board.failure, uuid=board.uuid.hex(), time=board.time, row=board.row)
+            app.fail_line(board.failure, uuid=board.uuid.hex(), time=local_time(board.time), row=board.row)
     elif board.error is not None:
-        of: dict[str, object] = {"uuid": board.uuid.hex(), "time": board.time, "row": board.row}
+        of: dict[str, object] = {"uuid": board.uuid.hex(), "time": time_for(app, board.time), "row": board.row}
         if app.json:
             of |= {"seconds": round(board.seconds, 3), **line}
             if isinstance(board.error, provisioning.build.UnrequestedChangeError):
@@ -396,6 +396,8 @@ def _summary(
         table.add_row(f"channel {channel.number}", what)
     if firmware:
         table.add_row("firmware", escape(firmware))
+    if "time" in more:
+        table.add_row("time", local_time(str(more["time"])))
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")
     print_table(console, table)
