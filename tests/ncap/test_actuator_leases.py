@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import LinkError, NodeBusyError, NodeRefusedError, PolicyError
+from teds_provision.errors import LinkError, NodeBusyError, NodeRefusedError, NoNodeError, PolicyError
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.ncap.nodes import actuator_leases
@@ -309,3 +309,156 @@ def test_an_actuator_that_a_topic_moves_is_busy(
     with pytest.raises(raised) if raised is not None else nullcontext():
         leases_of()._claimed(cast(Any, None), _HeldActuator("ab", 1, 0.0, order), order, again=again)
     assert course == ["1 mm 1000", "limits of 0.5", *([] if again else ["claimed"])]
+
+
+class Moved:
+    """An actuator that was claimed: what it was set to, in which unit, and its end."""
+
+    pause, safe = 0.1, True
+
+    def __init__(self, course: list[Any], unit: str | None) -> None:
+        self._course, self._unit = course, unit
+
+    def apply(self, value: float) -> Any:
+        self._course.append((value, self._unit))
+        if value > 1.0:
+            raise PolicyError("It exceeds the limits.")
+        return SimpleNamespace(as_json=lambda: {"value": value, "unit": self._unit})
+
+    def __exit__(self, *_: object) -> None:
+        self._course.append("released")
+
+
+@pytest.mark.parametrize(
+    ("orders", "stands", "course", "error"),
+    [
+        ([(0.5, "m"), (0.6, "m")], True, ["claimed m", (0.5, "m"), (0.6, "m"), "released"], None),
+        ([(0.5, "m"), (50.0, "mm")], True, ["claimed m", (0.5, "m"), "unit mm", (50.0, "mm"), "released"], PolicyError),
+        ([(0.5, "m"), (0.5, None)], True, ["claimed m", (0.5, "m"), "unit None", (0.5, None), "released"], None),
+        ([(2.0, "m")], True, ["claimed m", (2.0, "m"), "released"], PolicyError),
+        ([(0.5, "m"), (0.6, "m")], False, ["claimed m", (0.5, "m"), "released"], PolicyError),
+        ([(0.5, "m"), None], True, ["claimed m", (0.5, "m")], LinkError),
+    ],
+)
+def test_an_actuator_is_claimed_once_and_whatever_ends_its_lease_releases_it(
+    orders: list[Any], stands: bool, course: list[Any], error: type[Exception] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A refused set point releases it, too; so does a node that is on the whitelist no more."""
+    done: list[Any] = []
+    there = [True]
+
+    def require() -> None:
+        if not stands and (0.5, "m") in done:
+            raise PolicyError("It is not on the whitelist.")
+
+    class Leases(ActuatorLeases):
+        def _claimed(self, _trusted: Any, _held: Any, order: _SetPointOrder, *, again: bool) -> Any:
+            done.append(f"{'unit' if again else 'claimed'} {order.unit}")
+            return Moved(done, order.unit)
+
+        @staticmethod
+        def _until_news(held: _HeldActuator, answered: int, pause: float) -> None:
+            assert pause == 0.1
+            following = orders[answered] if answered < len(orders) else ()
+            if following is None:
+                there[0] = False
+            elif following:
+                held.order = _SetPointOrder(*following, answered + 1)
+
+    @contextmanager
+    def session(_uuid: str) -> Iterator[VerifiedSession | None]:
+        yield cast(Any, object()) if there[0] else None
+
+    standing = SimpleNamespace(require=require, drives=False)
+    monkeypatch.setattr(actuator_leases, "NodeStanding", lambda _station, _uuid: standing)
+    none = cast(Any, None)
+    leases = Leases(none, cast(Any, Events()), none, none, none, none, none)
+    value, unit = orders[0]
+    held = _HeldActuator("ab", 1, time.monotonic() - 1.0, _SetPointOrder(value, unit, 1))
+    if orders[-1] is None:
+        held.until += 100.0
+        course = [*course, "released"]
+    with pytest.raises(error) if error is not None else nullcontext():
+        leases._hold(held, session)
+    assert done == course
+    assert held.safe is True
+
+
+def test_a_node_that_is_lent_to_a_writer_or_on_no_bus_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[Any] = []
+
+    @contextmanager
+    def hold(uuid: str, what: str) -> Iterator[None]:
+        opened.append((uuid, what))
+        yield
+
+    lent, met = ["let go for write"], [cast(Any, None)]
+    desk = SimpleNamespace(contact=lambda _uuid: met[0])
+    leases = leases_of(desk=desk, turns=SimpleNamespace(hold=hold), lent_for=lambda _uuid: lent[0] if lent else None)
+    with pytest.raises(NodeBusyError, match="Node ab is busy: let go for write"), leases._own_session("ab"):
+        pass
+    lent.clear()
+    with pytest.raises(NoNodeError, match="is not on any bus"), leases._own_session("ab"):
+        pass
+    assert opened == []
+    met[0] = object()
+    monkeypatch.setattr(actuator_leases, "Conversation", lambda _contact, *, notice: nullcontext("node"))
+    monkeypatch.setattr(actuator_leases, "open_trusted", lambda _station, node, *, by: (node, by))
+    with leases._own_session("ab") as session:
+        assert session == ("node", "ncap")
+        assert opened == [("ab", "its actuators are held")]
+
+
+def test_the_first_set_point_has_fifteen_seconds_more_and_the_next_one_is_the_same_leases(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, begun = [100.0], list[tuple[float, str | None]]()
+
+    class Thread:
+        def __init__(self, *, target: Any, args: Any, **_more: Any) -> None:
+            self.words = args[2:]
+
+        def start(self) -> None:
+            begun.append(self.words)
+
+    monkeypatch.setattr(actuator_leases, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(actuator_leases.threading, "Thread", Thread)
+    leases = leases_of()
+    held, mine = leases._ordered("ab", 1, 0.5, "m", 2.0)
+    assert (held.until, held.order, mine, begun) == (117.0, _SetPointOrder(0.5, "m", 1), 1, [(0.5, "m")])
+    now[0] = 101.0
+    assert leases._ordered("ab", 1, 50.0, "mm", 0.25) == (held, 2)
+    assert (held.until, held.order, len(begun)) == (101.25, _SetPointOrder(50.0, "mm", 2), 1)
+    held.let_go = True
+    after, mine = leases._ordered("ab", 1, 0.7, None, 1.0)
+    assert (after.before, mine, len(begun)) == (held, 1, 2)
+    assert leases._held["ab", 1] is after
+    assert leases._ordered("ab", 2, 0.7, None, 1.0)[0].before is None
+
+
+def test_at_the_end_of_the_service_each_actuator_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    leases, order, ended = leases_of(), _SetPointOrder(0.0, None, 1), list[tuple[str, int]]()
+    for uuid, channel in (("ab", 1), ("ab", 2), ("cd", 1)):
+        leases._held[uuid, channel] = _HeldActuator(uuid, channel, 0.0, order)
+    monkeypatch.setattr(leases, "release_actuator", lambda *words: ended.append(words))
+    leases.end()
+    assert ended == [("ab", 1), ("ab", 2), ("cd", 1)]
+
+
+def test_who_lets_go_is_answered_when_the_node_has_answered() -> None:
+    class EndsMeanwhile(NewsOfTheEnd):
+        def notify_all(self) -> None:
+            self.course.append("it is to be let go")
+
+        def wait_for(self, over: Callable[[], bool], seconds: float) -> bool:
+            assert (held.let_go, over(), seconds) == (True, False, 15.0)
+            held.ended, held.safe, held.applied = True, True, {"value": 0.5}
+            return over()
+
+    course = list[str]()
+    leases = leases_of()
+    held = leases._held["ab", 1] = _HeldActuator(
+        "ab", 1, 0.0, _SetPointOrder(0.5, None, 1), news=cast(Any, EndsMeanwhile(course))
+    )
+    assert leases.release_actuator("ab", 1) == {"applied": {"value": 0.5}, "until": None, "safe": True}
+    assert course == ["it is to be let go"]

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import LinkError
+from teds_provision.errors import BadDataError, FrozenError, LinkError, NodeBusyError
 from teds_provision.links import Notice
 from teds_provision.measure import buses as buses_module
 from teds_provision.measure.blocks import NodeReport
@@ -25,7 +25,8 @@ from teds_provision.ncap.nodes.inspection import look
 from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch, PresenceCheck
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.running_measurement import RunningMeasurement
-from teds_provision.provisioning.conversation import Conversation
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.store.records import KeptMeasurement
 from tests.bench import MemoryLink, contact, make_station
 from tests.pace import until
@@ -414,3 +415,185 @@ def test_a_bus_that_was_opened_anew_is_heard_in_place_of_its_closed_port(monkeyp
     assert {cast(Any, bus.port).name for bus in buses.all()} == {"b", "c"}
     buses.close()
     assert course[-2:] == ["b closed", "c closed"]
+
+
+@pytest.mark.parametrize(
+    ("listed", "transparent", "tapped", "states", "taken"),
+    [
+        (True, False, False, ["came"], "workers"),
+        (True, True, False, ["came"], "workers"),
+        (False, True, False, ["came"], "for_strangers"),
+        (False, False, False, [], None),
+        (False, False, True, ["tapped"], "at once"),
+        (True, False, True, ["tapped"], "at once"),
+    ],
+)
+def test_who_comes_is_looked_at_by_detection_and_a_tap_at_once(
+    listed: bool,
+    transparent: bool,
+    tapped: bool,
+    states: list[str],
+    taken: str | None,
+    watch: LinkWatch,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A node of the whitelist never waits for strangers; in whitelist mode those are counted and no more."""
+    events, course = list[str](), list[str]()
+    monkeypatch.setattr(watch._live, "event", lambda _kind, **facts: events.append(facts["state"]), raising=False)
+    monkeypatch.setattr(link_watch, "is_listed", lambda _station, _uuid: listed)
+    monkeypatch.setattr(watch, "_transparent", lambda: transparent)
+    monkeypatch.setattr(watch, "_serve", lambda _contact: course.append("at once"))
+    for name in ("workers", "for_strangers"):
+        submitted: Any = SimpleNamespace(submit=lambda work, _contact, name=name: course.append(name))
+        monkeypatch.setattr(watch, f"_{name}", submitted)
+    node = sighting(9)
+    uuid, contact = node.uuid.hex(), node.contact()
+    contact.link.capabilities.tapped = tapped
+    watch._came(contact)
+    assert (events, course) == (states, [taken] if taken else [])
+    assert watch._directory.strangers(watch.place) == (0 if taken else 1)
+    seen = watch._directory.seen(uuid)
+    assert (seen.present, seen.place, seen.says) == ((True, "can:x", "factory") if taken else (False, "", None))
+    assert bool(seen.tapped) is tapped
+    if taken == "workers":
+        watch._came(contact)
+        assert course == ["workers"], "it is looked at already"
+
+
+@pytest.mark.parametrize(
+    ("origin", "tapped", "heard", "rest"),
+    [("session", False, None, False), ("kept", False, None, True), ("kept", True, None, False),
+     ("plain", False, {"verdict": "plain"}, False)],
+)  # fmt: skip
+def test_what_an_inspection_found_is_shown_and_the_rest_of_a_kept_datasheet_is_read_behind_it(
+    origin: str, tapped: bool, heard: Any, rest: bool, watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted, later = list[Any](), list[Any]()
+    contact = SimpleNamespace(link=SimpleNamespace(capabilities=SimpleNamespace(tapped=tapped)))
+    node: Any = SimpleNamespace(uuid=b"\xab" * 10, contact=contact)
+    verified = SimpleNamespace(verdict="authentic")
+    judged = SimpleNamespace(origin=origin, verified=verified, to_json=lambda: {"verdict": origin})
+    found = SimpleNamespace(judged=judged, sheet="sheet", power={"battery": 3}, firmware={"version": "1"})
+    directory: Any = SimpleNamespace(
+        show_sheet=lambda uuid, sheet: noted.append((uuid, sheet)),
+        refresh=noted.append,
+        note=lambda uuid, state, **facts: noted.append((uuid, state, facts)),
+    )
+    watch._directory = directory
+    watch._for_rest = cast(Any, SimpleNamespace(submit=lambda work, contact: later.append((work, contact))))
+    monkeypatch.setattr(link_watch, "look", lambda _station, _node: found)
+    monkeypatch.setattr(watch, "_wanted", lambda _contact: False)
+    watch._look(node)
+    assert noted == [], "the tap of a board that is not listed shows which one it is, and no more"
+    monkeypatch.setattr(watch, "_wanted", lambda _contact: True)
+    watch._look(node)
+    uuid = "ab" * 10
+    facts = noted[2][2]
+    assert noted[:2] == [(uuid, "sheet"), [uuid]]
+    assert noted[2][:2] == (uuid, "verified")
+    assert facts.pop("looked") > 0
+    assert facts == {
+        "verdict": "authentic", "heard": heard, "power": {"battery": 3}, "firmware": {"version": "1"}, "problem": None,
+    }  # fmt: skip
+    assert later == ([(watch._read_rest, contact)] if rest else [])
+
+
+class Met:
+    """A conversation with a node, which ends well."""
+
+    def __init__(self, *_words: Any, **_more: Any) -> None: ...
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "noted", "again"),
+    [
+        (None, NodeState.FACTORY, [], False),
+        (FrozenError("It is measured."), NodeState.FACTORY, [], True),
+        (FrozenError("It is measured."), NodeState.PROVISIONED, [], False),
+        (NodeBusyError("A command has it."), NodeState.FACTORY, [(None, "A command has it.")], False),
+        (SessionLostError(LinkError("Silent.")), NodeState.FACTORY, [("problem", "Silent.")], False),
+        (BadDataError("No TEDS."), NodeState.FACTORY, [("problem", "No TEDS.")], False),
+        (ZeroDivisionError(), NodeState.FACTORY, [("problem", "Unexpected failure: see the log.")], False),
+    ],
+)
+def test_an_inspection_that_fails_is_the_nodes_problem_and_ends_no_worker(
+    error: Exception | None,
+    state: NodeState,
+    noted: list[Any],
+    again: bool,
+    watch: LinkWatch,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that is measured is looked at again if it was reset: its measurement lets it go then."""
+    shown, refreshed, uuid = list[Any](), list[Any](), "ab" * 10
+
+    def serve_node(_node: Any) -> bool:
+        if error is not None:
+            raise error
+        return True
+
+    def note(_uuid: str, state: str | None = None, *, problem: Any) -> None:
+        shown.append((state, problem["message"]))
+
+    directory: Any = SimpleNamespace(note=note, refresh=refreshed.append)
+    watch._directory, watch._taps = directory, cast(Any, SimpleNamespace(serve_node=serve_node))
+    watch._pending.add(uuid)
+    monkeypatch.setattr(link_watch, "Conversation", Met)
+    contact: Any = SimpleNamespace(identity=SimpleNamespace(uuid=bytes.fromhex(uuid), state=state))
+    watch._serve(contact)
+    assert (shown, refreshed, watch._pending) == (noted, [[uuid]], set())
+    assert watch._looked_for == ({uuid} if again else set())
+    assert watch._node_locks.holder(uuid) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "found", "noted"),
+    [
+        (None, True, [("refreshed", ["ab" * 10]), ("verified", "authentic")]),
+        (None, False, [("refreshed", ["ab" * 10])]),
+        (LinkError("Silent."), False, []),
+        (SessionLostError(LinkError("Silent.")), False, []),
+        (ZeroDivisionError(), False, []),
+    ],
+)
+def test_the_rest_of_a_datasheet_that_cannot_be_read_now_is_no_problem(
+    error: Exception | None, found: bool, noted: list[Any], watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Any] = []
+
+    def read_anew(_station: Any, _node: Any) -> Any:
+        assert watch._node_locks.holder("ab" * 10) == "the rest of its datasheet is read"
+        if error is not None:
+            raise error
+        return ("image", SimpleNamespace(verified=SimpleNamespace(verdict="authentic"))) if found else None
+
+    def note(_uuid: str, state: str, *, verdict: str, looked: float) -> None:
+        shown.append((state, verdict))
+
+    watch._directory = cast(Any, SimpleNamespace(note=note, refresh=lambda uuids: shown.append(("refreshed", uuids))))
+    monkeypatch.setattr(link_watch, "Conversation", Met)
+    monkeypatch.setattr(link_watch, "read_anew", read_anew)
+    contact: Any = SimpleNamespace(identity=SimpleNamespace(uuid=b"\xab" * 10))
+    watch._read_rest(contact)
+    assert shown == noted
+
+
+def test_the_number_of_strangers_is_an_event_when_it_changed_and_at_most_every_ten_seconds(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, counts = [1000.0], list[int]()
+    monkeypatch.setattr(link_watch, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(watch._live, "event", lambda _kind, **facts: counts.append(facts["count"]), raising=False)
+    for at, uuid, there in (
+        (0.0, "aa", False), (0.0, "aa", True), (5.0, "bb", True), (9.9, "cc", True), (10.0, "cc", True),
+        (20.0, "cc", True), (25.0, "cc", False), (26.0, "cc", True), (35.0, "cc", True),
+    ):  # fmt: skip
+        now[0] = 1000.0 + at
+        watch._directory.stranger(watch.place, uuid, there=there)
+        watch._report_strangers()
+    assert counts == [1, 3, 2, 3]
