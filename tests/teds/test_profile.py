@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from contextlib import suppress
 from dataclasses import replace
@@ -274,6 +275,17 @@ def test_a_name_has_120_octets_and_a_degree_is_from_1_to_12(tmp_path: Path) -> N
         assert profile.channels[0].calibration.degree == degree
 
 
+@pytest.mark.parametrize(
+    ("model", "octets", "wanted"),
+    [("unsigned", 0, "1 to 8"), ("unsigned", 9, "1 to 8"), ("bits", 0, "1 to 255"), ("float32", 8, "4")],
+)
+def test_a_sample_has_as_many_octets_as_its_model_allows(tmp_path: Path, model: str, octets: int, wanted: str) -> None:
+    """A sample of no octets was accepted: nothing that is measured could be read."""
+    text = re.sub(r"sample = .*", f'sample = {{ model = "{model}", octets = {octets}, bits = 0 }}', GOOD)
+    with pytest.raises(BadDataError, match=f"a sample of model {model} has {wanted} octets, not {octets}"):
+        load_profile(write(tmp_path, "force", text))
+
+
 def test_the_narrower_selection_of_channels_wins(tmp_path: Path) -> None:
     text = GOOD.replace("[channel.1]", "[channel.all]").replace('"force"', '"f {channel}"')
     text += "[channel.2]\nhigh-limit = 2\n[channel.1-3]\nhigh-limit = 3\n"
@@ -324,7 +336,7 @@ def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:
         ('type = "sensor"', "type = 256", 7, "channel.1.type", "255"),
         ('"1 kHz"', '"1 kg"', 14, "channel.1.sampling-period", "time"),
         ("bits = 12", "bits = 17", 17, "channel.1.sample.bits", "16 bits"),
-        ("octets = 2", "octets = 9", 17, "channel.1.sample.octets", "0 to 8"),
+        ("octets = 2", "octets = 9", 17, "channel.1.sample.octets", "1 to 8"),
         ('"unsigned", octets = 2', '"float32", octets = 8', 17, "channel.1.sample.octets", "has 4 octets"),
         ('"unsigned", octets = 2', '"float64", octets = 4', 17, "channel.1.sample.octets", "has 8 octets"),
         ('"unsigned", octets = 2', '"fraction", octets = 9', 17, "channel.1.sample.octets", "1 to 8"),

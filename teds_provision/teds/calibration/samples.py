@@ -44,7 +44,7 @@ MODEL_NAMES: Final = (
     "time of day",
 )
 # Octets of one sample, minimum and maximum, by data model; other models are reserved.
-_OCTETS: Final = {
+SAMPLE_OCTETS: Final = {
     DataModel.UNSIGNED: (1, 8),
     DataModel.FLOAT32: (4, 4),
     DataModel.FLOAT64: (8, 8),
@@ -83,9 +83,9 @@ class SampleForm:
     @property
     def problem(self) -> str:
         """Why samples of this form cannot be read as numbers, as half a sentence; "" if they can."""
-        if self.model not in _OCTETS:
+        if self.model not in SAMPLE_OCTETS:
             return f"its data model {self.model} is reserved"
-        least, most = _OCTETS[DataModel(self.model)]
+        least, most = SAMPLE_OCTETS[DataModel(self.model)]
         if not least <= self.octets <= most:
             asked = str(least) if least == most else f"{least} to {most}"
             return f"its samples are {model_name(self.model)} of {self.octets} octets; {asked} are possible"

@@ -7,6 +7,7 @@ from typing import Final, cast
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import MAXIMUM_DEGREE, METHODS, Monotone
+from teds_provision.teds.calibration.samples import SAMPLE_OCTETS, DataModel
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.profile.firmware import firmware_demand
@@ -153,17 +154,8 @@ def _sample(section: Section) -> dict[str, object]:
 
 
 def _check_sample(sample: Section, model: int, octets: int, bits: int) -> None:
-    lengths = {
-        "unsigned": (0, 8),
-        "float32": (4, 4),
-        "float64": (8, 8),
-        "fraction": (1, 8),
-        "long-integer": (9, 255),
-        "long-fraction": (9, 255),
-        "time-of-day": (8, 8),
-    }
-    name = next((name for name, code in MODELS.items() if code == model), "")
-    low, high = lengths.get(name, (0, 255))
+    name = next(name for name, code in MODELS.items() if code == model)
+    low, high = SAMPLE_OCTETS[DataModel(model)]
     if not low <= octets <= high:
         wanted = str(low) if low == high else f"{low} to {high}"
         sample.error("octets", f"a sample of model {name} has {wanted} octets, not {octets}.")
