@@ -1,7 +1,7 @@
 """The limits of every reader of files in one place, listed in docs/formats.md.
 
 Untrusted input is checked cheaply (octets, tags, brackets, depth) before anything is built from it, so that no file
-costs more than 10 s and 300 MB. Every check raises BadDataError that names the excess and the limit. This module is
+costs more than 10 s and 400 MB. Every check raises BadDataError that names the excess and the limit. This module is
 below every room and imports nothing of ours but the errors, the decoder of JSON, and ``late``.
 """
 

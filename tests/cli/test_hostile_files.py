@@ -202,3 +202,10 @@ def measured(home: Path, *command: object) -> tuple[int, float, float, str]:
     os.close(read)
     code, seconds, megabytes = done.stderr.splitlines()[-1].split()
     return int(code), float(seconds), float(megabytes), done.stdout
+
+
+def test_the_page_and_the_code_name_the_bounds_that_are_tested() -> None:
+    """The code had 300 MB when the tests and the page had 400."""
+    bounds = f"costs more than {SECONDS} s and {MEGABYTES} MB"
+    for file in ("docs/formats.md", "teds_provision/limits.py"):
+        assert bounds in " ".join((ROOT / file).read_text(encoding="utf-8").split()), file
