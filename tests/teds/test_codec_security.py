@@ -166,3 +166,13 @@ def test_layouts_that_are_remembered_are_few_and_short() -> None:
     many = ours(signed_blocks={(channel, 3): bytes(32) for channel in range(256)})
     assert len(security.decode(many).signed_blocks) == 256
     assert not security._LAYOUTS
+
+
+@pytest.mark.parametrize("name", ["signed_blocks", "values", "extra"])
+def test_what_was_decoded_cannot_be_changed_for_the_next_reader(name: str) -> None:
+    """The result is cached: who changed it changed what every later reader of these octets was given."""
+    octets = ours(signed_blocks={(0, 1): bytes(32)}, extra={120: b"more"})
+    before = dict(getattr(security.decode(octets), name))
+    with pytest.raises(TypeError):
+        getattr(security.decode(octets), name)[next(iter(before))] = 0
+    assert getattr(security.decode(octets), name) == before

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from struct import Struct
+from types import MappingProxyType
 from typing import Final
 
 from teds_provision.errors import BadDataError
@@ -25,7 +26,7 @@ SIGNED_BLOCK, PROFILE_VERSION, SESSION_SUITE, KEY_AGREEMENT = 108, 105, 109, 110
 
 # The profile's values for Tables 2 to 5, ProfileVersion, SessionSuite and KeyAgreement; no others are built or
 # accepted.
-OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 2}
+OUR_VALUES: Final[Mapping[int, int]] = MappingProxyType({1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 2})
 _U8 = (1, 2, 3, 4, 105, 109, 110)
 _BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
 _OCTETS = dict.fromkeys(_U8, 1) | dict.fromkeys(_BASE64, 88) | {6: 8, 106: 4, 107: 4}
@@ -61,9 +62,9 @@ class SecurityTeds:
     signature: bytes | None = None
     station_key: bytes | None = None
     station_key_signature: bytes | None = None
-    signed_blocks: dict[BlockId, bytes] = field(default_factory=dict)
-    values: dict[int, int] = field(default_factory=lambda: dict(OUR_VALUES))
-    extra: dict[int, bytes] = field(default_factory=dict)
+    signed_blocks: Mapping[BlockId, bytes] = field(default_factory=lambda: MappingProxyType({}))
+    values: Mapping[int, int] = field(default_factory=lambda: OUR_VALUES)
+    extra: Mapping[int, bytes] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def signed(self) -> bool:
@@ -190,9 +191,9 @@ def _read(block: bytes, layout: _Layout, found: tuple[bytes, ...]) -> SecurityTe
         signature=raw.get(SIGNATURE),
         station_key=raw.get(STATION_KEY),
         station_key_signature=raw.get(STATION_KEY_SIGNATURE),
-        signed_blocks=_signed_blocks(found[layout.blocks]),
-        values={number: values[number][0] for number in _U8},
-        extra={number: values[number] for number in layout.extra},
+        signed_blocks=MappingProxyType(_signed_blocks(found[layout.blocks])),
+        values=MappingProxyType({number: values[number][0] for number in _U8}),
+        extra=MappingProxyType({number: values[number] for number in layout.extra}),
     )
 
 
