@@ -64,6 +64,27 @@ def test_a_number_has_the_digits_that_its_uncertainty_allows(stage: Stage) -> No
     )
 
 
+def test_who_holds_a_node_and_whether_a_newer_datasheet_was_written(stage: Stage) -> None:
+    """`older_than` was in the answer, and nowhere on the page."""
+    nobody = {"holders": {}, "epoch": NONE, "written_by": NONE, "older_than": NONE, "firmware": NONE}
+    held = {"holders": {"a1": ["north"], "b2": ["south"]}, "epoch": 3, "sequence": 7, "written_by": "west"}
+    runs = {"text": "nrf/loadcell", "version": "1.3.0", "build": NONE, "by": "south"}
+    stage.table(
+        "format.heldBy(one)",
+        [
+            (nobody, "no holder, firmware not reported"),
+            (
+                {**nobody, **held, "firmware": runs},
+                "held by north, south (epoch 3), datasheet 7 by west, firmware nrf/loadcell 1.3.0 (seen by south)",
+            ),
+            (
+                {**nobody, "older_than": "west", "firmware": {"version": NONE, "by": "south"}},
+                "no holder, firmware not reported (asked by south); the datasheet known here is older than west wrote",
+            ),
+        ],
+    )
+
+
 def test_what_has_no_number_says_why(stage: Stage) -> None:
     plain, bare = {"number": 1, "uncertainty": 0.1}, {"number": 1, "problem": "no calibration"}
     stage.table(

@@ -155,3 +155,19 @@ function judged(of) {
   if (known) return known;
   return ["plain", "ask", "Not checked", "This node has not been verified yet."];
 }
+
+/** "held by north, south (epoch 3), datasheet 7 by north, firmware not reported". */
+export function heldBy(says) {
+  const who = Object.values(says.holders).flat();
+  const held = who.length ? `held by ${who.join(", ")} (epoch ${says.epoch})` : "no holder";
+  const written = says.written_by ? `, datasheet ${says.sequence} by ${says.written_by}` : "";
+  const older = says.older_than ? `; the datasheet known here is older than ${says.older_than} wrote` : "";
+  return `${held}${written}, ${firmware(says.firmware)}${older}`;
+}
+
+/** "firmware nrf/loadcell 1.3.0 (seen by south)"; null: no station reports any. */
+function firmware(told) {
+  if (!told) return "firmware not reported";
+  if (told.version === null) return `firmware not reported (asked by ${told.by})`;
+  return `firmware ${`${told.text} ${told.version}${told.build ? `+${told.build}` : ""}`.trim()} (seen by ${told.by})`;
+}

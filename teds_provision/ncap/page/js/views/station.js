@@ -2,7 +2,7 @@
 
 import { change, get } from "../api.js";
 import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
-import { byName, channelName, clock, count, grouped, nameOf, short } from "../format.js";
+import { byName, channelName, clock, count, grouped, heldBy, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
 import { linkName } from "./facts.js";
 import { linePanel } from "./line.js";
@@ -146,21 +146,6 @@ const PLANT_EVERY = 10000; // ms
 const TONES = { here: "good", heard: "good", retired: "plain", lost: "plain", stolen: "plain" };
 
 const short8 = (uuid) => `node ${uuid.slice(0, 8)}`;
-
-/** "held by north, south (epoch 3), datasheet 7 by north". */
-function heldBy(says) {
-  const who = Object.values(says.holders).flat();
-  const held = who.length ? `held by ${who.join(", ")} (epoch ${says.epoch})` : "no holder";
-  const written = says.written_by ? `, datasheet ${says.sequence} by ${says.written_by}` : "";
-  return `${held}${written}, ${firmware(says.firmware)}`;
-}
-
-/** "firmware nrf/loadcell 1.3.0 (seen by south)"; null: no station reports any. */
-function firmware(told) {
-  if (!told) return "firmware not reported";
-  if (told.version === null) return `firmware not reported (asked by ${told.by})`;
-  return `firmware ${`${told.text} ${told.version}${told.build ? `+${told.build}` : ""}`.trim()} (seen by ${told.by})`;
-}
 
 function ago(seconds) {
   for (const [unit, length] of [["days", 86400], ["h", 3600], ["min", 60]]) if (seconds >= 2 * length) return `${Math.floor(seconds / length)} ${unit}`;
