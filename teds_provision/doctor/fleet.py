@@ -45,7 +45,7 @@ def config(system: System) -> Iterator[Finding]:
     if bad:
         yield Finding("config", "failed", bad, "Fix that line.")
     else:
-        yield Finding("config", "ok", f"{path} contains {len(values)} settings.")
+        yield Finding("config", "ok", f"{path} contains {counted(len(values), 'setting')}.")
 
 
 def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:

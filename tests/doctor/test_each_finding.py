@@ -1,12 +1,14 @@
-"""The doctor's findings about readers, buses, Bluetooth and the machine, word for word, each fault made here."""
+"""The doctor's findings about readers, buses, Bluetooth, machine and station, word for word, each fault made here."""
 
 from __future__ import annotations
 
 import json
 import os
 import socket
+import sqlite3
 import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +17,13 @@ from typing import Any
 import pytest
 
 from teds_provision.doctor import links, machine
-from teds_provision.doctor.checks import Finding, System, exit_code, intact
-from teds_provision.errors import NoReaderError
+from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code, intact
+from teds_provision.errors import KeyringUnavailableError, NoReaderError, VaultError
 from teds_provision.links.nfc import pcsc_readers
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import StationRecord
 
+from ..bench import copy_home
 from .test_doctor import plug_in
 
 
@@ -401,3 +406,108 @@ def test_a_part_that_was_checked_says_so() -> None:
     )
     whole: Any = SimpleNamespace(sampled=False)
     assert intact("nodes", "all 3", "2 of 3", whole) == Finding("nodes", "ok", "all 3.")
+
+
+# -- the station, word for word ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stationed(system: System) -> System:
+    copy_home(system.home)
+    return system
+
+
+def words(system: System, name: str) -> list[tuple[str, str, str]]:
+    """Return result, reason and cure of each finding of one check."""
+    if name not in CHECKS:
+        list(examine(System(system.home / "nowhere")))
+    return [(finding.result, finding.why, finding.fix) for finding in CHECKS[name][1](system)]
+
+
+def test_an_init_that_was_cut_is_named_with_its_cure(system: System) -> None:
+    system.home.mkdir(mode=0o700)
+    Station.make(system.home).close()
+    assert words(system, "store") == [
+        ("warning", "init was started here but not finished.", "teds-provision init")
+    ]  # fmt: skip
+    assert words(system, "vault") == [("skipped", "There is no station yet.", "teds-provision init")]
+
+
+def test_a_broken_chain_says_where(stationed: System) -> None:
+    with closing(sqlite3.connect(stationed.home / "store.sqlite3")) as connection, connection:
+        connection.execute("DROP TRIGGER audit_is_never_changed")
+        connection.execute("UPDATE audit SET outcome = 'x' WHERE seq = 1")
+    (log,) = (one for one in words(stationed, "store") if "chain" in one[1])
+    assert log == (
+        "failed",
+        "The hash chain is broken: entry 1 was changed, or the one before.",
+        "Keep a copy, run teds-provision log, and find out who changed the file.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("left", "said"),
+    [
+        (None, ("ok", "The vault is locked.", "")),
+        (754, ("warning", "The vault stays unlocked for 12 min 34 s more, for every process of this user.",
+               "teds-provision lock")),
+        (0, ("warning", "The vault stays unlocked for 0 min 0 s more, for every process of this user.",
+             "teds-provision lock")),
+    ],
+)  # fmt: skip
+def test_how_long_the_vault_stays_open(
+    system: System, monkeypatch: pytest.MonkeyPatch, left: int | None, said: tuple[str, str, str]
+) -> None:
+    monkeypatch.setattr("teds_provision.doctor.station.agent.seconds_left", lambda home: left)
+    assert words(system, "unlock") == [said]
+
+
+def test_a_token_is_there_with_its_file(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Station.inspect(stationed.home) as store:
+        store.identity.put(StationRecord("bench", "pkcs11:token=bench?module-path=/m.so"))
+    monkeypatch.setattr("teds_provision.doctor.station.find_token", lambda uri: SimpleNamespace(label="bench  "))
+    with pytest.raises(VaultError, match=r"The file vault-pkcs11\.json is missing") as missing:
+        words(stationed, "vault")
+    assert missing.value.hint == "teds-provision restore FILE"
+    (stationed.home / "vault-pkcs11.json").touch()
+    assert words(stationed, "vault") == [("ok", "The token 'bench' is there.", "")]
+    assert words(stationed, "keyring") == [("skipped", "Not used by this station.", "")]
+
+
+def test_a_machine_without_a_keyring_gets_a_passphrase_file(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    for error, fix in (
+        (KeyringUnavailableError("There is none.", hint="Start one."), "teds-provision init --keystore file"),
+        (VaultError("It is locked.", hint="Unlock it."), "Unlock it."),
+    ):
+        monkeypatch.setattr("teds_provision.doctor.station.inspect", raising(error))
+        assert words(system, "keyring") == [("warning", f"{error.message} init will use a passphrase file.", fix)]
+    monkeypatch.setattr("teds_provision.doctor.station.inspect", lambda: "KWallet")
+    assert words(system, "keyring") == [("ok", "KWallet.", "")]
+
+
+def raising(error: Exception) -> Callable[[], str]:
+    def fail() -> str:
+        raise error
+
+    return fail
+
+
+def test_settings_are_named_and_the_first_five_of_the_unknown_ones(system: System) -> None:
+    assert words(system, "config") == [("skipped", "There is no config.toml.", "")]
+    system.home.mkdir()
+    path = system.home / "config.toml"
+    known: dict[str, frozenset[str]] = {"": frozenset({"via"}), "node-check": frozenset({"dry-run"})}
+    told = replace(
+        system, settings=lambda: known, bad_value=lambda values: "via is no link." if "via" in values else ""
+    )
+    path.write_text("[node_check]\ndry_run = true\n")
+    assert words(told, "config") == [("ok", f"{path} contains 1 setting.", "")]
+    path.write_text("via = 'x'\n")
+    assert words(told, "config") == [("failed", "via is no link.", "Fix that line.")]
+    path.write_text("via = 'x'\na = 1\nb = 1\nc = 1\nd = 1\ne = 1\nf = 1\n")
+    assert words(told, "config") == [
+        ("failed", f"{path} has unknown settings: a, b, c, d, e.", f"Remove them from {path}.")
+    ]  # fmt: skip
+    path.write_text("[node-check]\nno-such = 1\n")
+    assert words(told, "config")[0][1] == f"{path} has unknown settings: node-check.no-such."
+    assert words(replace(told, settings=None), "config")[0][0] == "ok", "names that nobody knows are no fault"

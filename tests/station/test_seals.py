@@ -321,3 +321,25 @@ def test_a_ca_key_that_is_not_the_owners_certifies_nobody(home: Path, opened: Op
     assert station.identity.certificate(station.ca, POINT) == b"kept before".ljust(64), "the first one stays"
     with pytest.raises(NotAuthenticError, match="did not sign the station"):
         station.identity.keep_certificate(OTHER, POINT, signature)
+
+
+def test_a_hint_about_firmware_needs_no_seal_and_becomes_no_report_of_a_session(home: Path, opened: Open) -> None:
+    first, second = bytes(10), b"\1" * 10
+    closed = opened()
+    for uuid in (first, second):
+        closed.nodes.remember(uuid)
+        closed.firmware_reports.keep(uuid, bytes(42), in_session=False)
+    station = opened()
+    station.unlock()
+    sealed = station.firmware_reports.keep(second, bytes(43), in_session=False)
+    assert [record.report for record in station.firmware_reports.all()] == [bytes(42), bytes(43)]
+    assert list(station.row_macs.all_broken()) == [], "a hint decides nothing, with a seal or without one"
+    assert sealed.at
+    behind_its_back(home, "UPDATE firmware SET in_session = 1")
+    again = opened()
+    assert len(list(again.firmware_reports.all())) == 2, "nobody can tell while the vault is closed"
+    again.unlock()
+    assert [again.firmware_reports.get(uuid) for uuid in (first, second)] == [None, None]
+    assert sorted(again.row_macs.all_broken()) == [
+        f"the firmware report of {uuid.hex()}" for uuid in (first, second)
+    ]  # fmt: skip
