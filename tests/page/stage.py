@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import teds_provision
 
+from .lab import PATIENCE
+
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Route
 
@@ -106,6 +108,7 @@ def staged(browser: Browser, *modules: str) -> Iterator[Stage]:
     context.add_init_script(STATION)
     context.route("**/*", _serve)
     page = context.new_page()
+    page.set_default_timeout(PATIENCE)
     wrong: list[str] = []
     page.on("pageerror", lambda error: wrong.append(str(error)))
     try:
