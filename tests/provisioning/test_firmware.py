@@ -39,9 +39,16 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.verify_node import verify_at_node
-from teds_provision.station.firmware import FirmwareDemands, FirmwareReading, firmware_of, state_of
+from teds_provision.station.firmware import (
+    FirmwareDemands,
+    FirmwareReading,
+    firmware_of,
+    known_firmware,
+    same_firmware,
+    state_of,
+)
 from teds_provision.station.station import Station
-from teds_provision.teds.profile.firmware import FirmwareDemand
+from teds_provision.teds.profile.firmware import FirmwareDemand, parse_release
 from tests.bench import Board, MemoryLink, contact
 from tests.cli.shell import call
 from tests.e2e.desk import ANGLE
@@ -189,6 +196,69 @@ def test_the_first_state_that_applies(report: FirmwareReport | None, state: str)
 def test_what_the_table_of_a_type_means(tmp_path: Path, table: str, report: FirmwareReport, state: str) -> None:
     demand = teds.profile.load_profile(Path(profile(tmp_path, f"[firmware]\n{table}\n"))).firmware
     assert state_of(demand, report) == state
+
+
+BARE = FirmwareReport("nrf/angle", (1, 2, 0), 3)
+"""Of a firmware that does not report its image's digest."""
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        (None, None, True),
+        (None, BARE, False),
+        (GOOD, GOOD, True),
+        (GOOD, FirmwareReport("x", (9, 9, 9), 9, GOOD.image), True),  # the digest is the image
+        (GOOD, FirmwareReport("nrf/angle", (1, 2, 0), 3, bytes([9]) * 32), False),
+        (GOOD, TRIAL, True),
+        (GOOD, BARE, False),  # nobody knows
+        (BARE, FirmwareReport("nrf/angle", (1, 2, 0), 3, flags=FirmwareFlag.PENDING), True),
+        (BARE, FirmwareReport("nrf/angle", (1, 2, 0), 4), False),
+        (BARE, FirmwareReport("nrf/angle", (1, 2, 1), 3), False),
+        (BARE, FirmwareReport("nrf/force", (1, 2, 0), 3), False),
+    ],
+)
+def test_the_same_firmware_is_the_same_image_or_without_digests_the_same_build(
+    one: FirmwareReport | None, other: FirmwareReport | None, same: bool
+) -> None:
+    assert same_firmware(one, other) is same_firmware(other, one) is same
+
+
+@pytest.mark.parametrize(
+    ("signed", "now", "sealed", "changed"),
+    [
+        (OLD, GOOD, True, True),
+        (OLD, GOOD, False, False),  # anybody may say so
+        (GOOD, GOOD, True, False),
+        (GOOD, None, True, True),
+        (None, GOOD, True, False),  # never signed
+    ],
+)
+def test_only_what_is_said_in_a_session_shows_a_change_since_the_signature(
+    signed: FirmwareReport | None, now: FirmwareReport | None, sealed: bool, changed: bool
+) -> None:
+    octets = None if signed is None else signed.encode()
+    record: Any = SimpleNamespace(report=GOOD.encode(), in_session=True, signed=octets)
+    known = known_firmware(record, lambda: DEMAND, FirmwareReading(now, sealed))
+    assert known is not None
+    assert known.changed is changed
+    kept = known_firmware(SimpleNamespace(report=GOOD.encode(), in_session=sealed, signed=octets), lambda: None)  # type: ignore[arg-type]
+    assert kept is not None
+    assert (kept.reading, kept.state) == (FirmwareReading(GOOD, sealed), "unjudged")
+    assert known_firmware(None, lambda: DEMAND) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "release"),
+    [
+        ("1.2.3", (1, 2, 3, 0)),
+        ("0.0.0+0", (0, 0, 0, 0)),
+        ("255.255.65535+4294967295", (255, 255, 65535, 4294967295)),
+        *((text, None) for text in ("256.0.0", "0.256.0", "0.0.65536", "0.0.0+4294967296", "1.2", "1.2.3+", "01.2.3")),
+    ],
+)
+def test_a_version_is_one_that_a_node_can_report(text: str, release: tuple[int, ...] | None) -> None:
+    assert parse_release(text) == release
 
 
 TABLE = '[firmware]\ntext = "*/angle"\nminimum = "1.2.0"\n'

@@ -561,3 +561,64 @@ def test_what_a_compensated_channel_needs_is_named_on_the_way_back() -> None:
             interpreter.encode(5.0, others)
     other = {2: np.array([7], dtype=np.uint64)}
     assert int.from_bytes(interpreter.encode(5.0, other), "big") == pytest.approx(32768, abs=1)
+
+
+def test_a_curve_in_another_unit_than_the_channels_is_converted_with_its_zero() -> None:
+    """212 °F are 100 °C and 373.15 K; and the way back."""
+    line = replace(fit([(0, -40.0), (32767, 287.67)], "linear", channel=1), unit=parse_unit("degF"))
+    interpreter = ChannelInterpreter(sheet_of("temperature-sensor", {1: line}), 1)
+    found = interpreter.values(np.array([25200], dtype=np.uint64))
+    assert found.valid.all()
+    assert interpreter.unit.to_si(float(found.value[0])) == pytest.approx(373.15, abs=1e-3)
+    assert int.from_bytes(interpreter.encode(found.value), "big") == 25200
+    assert interpreter.given == pytest.approx(tuple(interpreter.unit.from_si(k) for k in (233.15, 415.19)), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("sample", "why"),
+    [
+        (SampleForm(1, 3), "has samples that cannot be read"),
+        (None, "has samples that cannot be read"),
+        (..., "is not described"),
+    ],
+)
+def test_a_channel_that_compensates_must_be_described_and_readable(sample: object, why: str) -> None:
+    parts = (CalibrationInput(1, 1, (0, 65535), (0,)), CalibrationInput(2, 1, (0, 65535), (0,)))
+    both = Calibration(1, "polynomial", parts, (0.0, 0.0, 10 / 65535, 0.0), unit=parse_unit("N"))
+    sheet = sheet_of("tactile-finger-sensor", {1: both})
+    sheet = replace(sheet, channels=sheet.channels[:1]) if sample is ... else changed(sheet, 2, sample=sample)
+    assert ChannelInterpreter(sheet, 1).problem == f"Channel 1 is compensated by channel 2, which {why}."
+
+
+def test_an_actuator_with_several_inputs_cannot_be_set() -> None:
+    parts = (CalibrationInput(1, 1, (0, 110), (0,)), CalibrationInput(2, 1, (0, 4095), (0,)))
+    both = Calibration(1, "polynomial", parts, (0.0, 0.0, 30.0, 0.0), unit=parse_unit("mm"), actuator=True)
+    interpreter = ChannelInterpreter(actuator(both), 1)
+    assert interpreter.problem == "The calibration of actuator 1 takes several inputs; one is what can be set here."
+
+
+def test_the_limits_of_a_value_have_room_for_its_uncertainty_and_for_rounding() -> None:
+    interpreter = ChannelInterpreter(changed(sheet_of("load-cell"), low=-1e6, high=1e6, uncertainty=5.0), 1)
+    low, high = interpreter.accepted
+    assert interpreter.unit.to_si(high) > 1e6 + 5 > interpreter.unit.to_si(high) - 2
+    assert interpreter.unit.to_si(low) < -1e6 - 5 < interpreter.unit.to_si(low) + 2
+
+
+@pytest.mark.parametrize(
+    ("model", "octets", "bits", "ends"),
+    [
+        (0, 2, 0, (0, 65535)),
+        (0, 2, 12, (0, 4095)),
+        (0, 2, 17, (0, 65535)),
+        (5, 9, 0, (0, 2.0**72)),
+        (5, 128, 1023, (0, 2.0**1023)),
+        (5, 128, 0, None),
+        (3, 1, 0, (0, 1 - 2**-8)),
+        (6, 9, 70, (0, 1.0)),
+        (1, 4, 32, None),
+        (4, 2, 16, None),
+        (7, 8, 64, None),
+    ],
+)
+def test_which_raw_values_a_form_can_hold(model: int, octets: int, bits: int, ends: tuple[float, float] | None) -> None:
+    assert SampleForm(model, octets, bits).raw_range == ends
