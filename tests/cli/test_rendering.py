@@ -270,3 +270,47 @@ def test_where_foxglove_is_served() -> None:
     assert foxglove_address(False, None) is None
     assert foxglove_address(True, None) == "127.0.0.1:8765"
     assert foxglove_address(False, "0.0.0.0:1") == foxglove_address(True, "0.0.0.0:1") == "0.0.0.0:1"
+
+
+# -- the live line -----------------------------------------------------------------------------------------------------
+
+
+def test_the_live_line_has_the_step_that_runs_and_what_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    above: list[str] = []
+    console = SimpleNamespace(print=lambda text, **_: above.append(str(text)))
+    live = rendering.LiveReporter(cast("Any", SimpleNamespace(console=lambda **_: console)))
+    monkeypatch.setattr(live, "_show", lambda: None)
+
+    def line() -> str:
+        return str(cast("Any", live._render()).text)
+
+    live.started("identify")
+    assert line() == "identify"
+    live.notice(Notice("waiting", "Waiting for a tap.", seconds=30))
+    assert line().startswith("identify  Waiting for a tap. (")
+    assert line().endswith(" s left)")
+    live.notice(Notice("retry", "Again."))
+    assert (line(), above) == ("identify  Again.", [])
+    live.notice(Notice("node-came", "A node came."))
+    assert (line(), above) == ("identify  Again.", ["… A node came."])
+    live.started("agree")
+    assert line() == "agree", "what the step before waited for is over"
+    live.written(3, 7)
+    assert line() == "agree  3 of 7 octets"
+    live.finished(StepResult("agree", seconds=0.5))
+    live.notice(Notice("node-left", "It left."))
+    assert line() == "3 of 7 octets"
+    assert above[1:] == ["✓ agree         0.50 s", "… It left."]
+
+
+@pytest.mark.parametrize(("count", "last"), [(2, "b"), (3, "c"), (4, "  … and 1 more"), (9, "  … and 6 more")])
+def test_of_a_long_list_the_first_lines_and_how_many_more_there_are(count: int, last: str) -> None:
+    lines = list("abcdefghi"[:count])
+    found = rendering.first_lines(lines, 3, count)
+    assert found == [*lines[:3], last] if count > 3 else found == lines
+    assert found[-1] == last
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_a_value_that_is_no_number_is_shown_as_it_is(value: float) -> None:
+    assert tidy(value, 0.5) == value

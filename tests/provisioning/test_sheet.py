@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,7 +37,7 @@ from teds_provision.provisioning.batch_sheet import (
     worse,
     write_report,
 )
-from teds_provision.provisioning.build import BuildOrder, named_for, prepare
+from teds_provision.provisioning.build import BuildOrder, check_name, for_several, named_for, prepare
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
@@ -695,3 +696,71 @@ def test_a_board_of_a_bus_that_is_not_meant_is_named_with_the_list_that_it_is_no
     station.notice = notices.append
     assert run._is_meant(contact(there)) == (said is None)
     assert notices == ([] if said is None else [f"Skipped: node {there.uuid.hex()} {said}"])
+
+
+@pytest.mark.parametrize(
+    ("order", "refused"),
+    [
+        (BuildOrder(), ""),
+        (BuildOrder(profile="load-cell", item="i", drop_calibration=True), ""),
+        (BuildOrder(name="cell {n}"), ""),
+        (BuildOrder(name="cell {uuid}"), ""),
+        (BuildOrder(name="cell"), "Every node would get the name 'cell'."),
+        (BuildOrder(name="cell {m}"), "Every node would get the name 'cell {m}'."),
+        (
+            BuildOrder(calibration=Path("a.csv")),
+            "Every node would get the calibration a.csv: it belongs to one sensor.",
+        ),
+    ],
+)
+def test_what_may_be_ordered_for_many_boards(order: BuildOrder, refused: str) -> None:
+    if not refused:
+        assert for_several(order) is order
+        return
+    with pytest.raises(UsageError) as error:
+        for_several(order)
+    assert error.value.message.startswith(refused)
+    assert error.value.hint.endswith("list the boards in a sheet: --batch FILE.") or error.value.hint.startswith("List")
+
+
+@pytest.mark.parametrize("more", [{"profile": "load-cell"}, {"calibration": Path("a.csv")}, {"drop_calibration": True}])
+def test_what_a_board_brought_is_signed_as_it_is(station: Station, more: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="--adopt signs the datasheet that the board brought"):
+        prepare(station, BuildOrder(adopt=True, **more))
+    assert prepare(station, BuildOrder(adopt=True, name="a")).profile is None
+
+
+def test_a_board_without_a_known_type_gets_nothing_that_is_named(station: Station, tmp_path: Path) -> None:
+    uuid = board_of(1)
+    assert prepare(station, BuildOrder(), uuid).profile is None, "the board itself may be finished"
+    for order in (BuildOrder(name="a"), BuildOrder(drop_calibration=True)):
+        with pytest.raises(UsageError, match=rf"^No profile is known for node {uuid.hex()}\.$"):
+            prepare(station, order, uuid)
+        assert prepare(station, order).profile is None, "any board may come"
+    station.nodes.remember(uuid, profile="load-cell")
+    prepared = prepare(station, BuildOrder(name="a"), uuid)
+    assert prepared.profile is not None
+    assert prepared.profile.name == "load-cell"
+    with pytest.raises(NotFoundError, match=r"^There is no calibration file .*none\.csv\.$"):
+        prepare(station, BuildOrder(calibration=tmp_path / "none.csv"))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a" * 120, ""),
+        ("ä" * 60, ""),
+        ("a" * 121, "A name has 1 to 120 octets of UTF-8, this one 121."),
+        ("ä" * 61, "A name has 1 to 120 octets of UTF-8, this one 122."),
+        ("", "A name has 1 to 120 octets of UTF-8, this one 0."),
+        ("a\tb", "A name is one line of printable characters, not 'a\\tb'."),
+        ("a\udcff", "The name of the node is not valid text."),
+    ],
+)
+def test_a_name_fits_into_its_teds_and_is_shown_whole(name: str, message: str) -> None:
+    if not message:
+        check_name(name)
+        return
+    with pytest.raises((UsageError, BadDataError)) as refused:
+        check_name(name)
+    assert refused.value.message == message
