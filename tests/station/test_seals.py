@@ -343,3 +343,18 @@ def test_a_hint_about_firmware_needs_no_seal_and_becomes_no_report_of_a_session(
     assert sorted(again.row_macs.all_broken()) == [
         f"the firmware report of {uuid.hex()}" for uuid in (first, second)
     ]  # fmt: skip
+
+
+def test_a_changed_request_for_a_certificate_stops_the_vault(home: Path, opened: Open) -> None:
+    """The key that a CA is asked to certify is this station's own."""
+    station = opened()
+    record = station.identity.record()
+    assert record is not None
+    station.unlock()
+    values = (POINT, record.point, record.ca, record.signature, None)
+    sealed = replace(record, requested=POINT, mac=station.row_macs.mac("station", values))
+    station.identity.put(sealed)
+    opened().unlock()
+    station.identity.put(replace(sealed, requested=OTHER))
+    with pytest.raises(StoreChangedError, match="own key or CA"):
+        opened().unlock()
