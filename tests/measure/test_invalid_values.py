@@ -153,3 +153,16 @@ def test_raw_values_of_different_forms_stay_exact(raw: int, dtype: str) -> None:
     [block] = heard.blocks([StreamMessage(0, 0, 10**9, 0, struct.pack(">fQ", 0.5, raw))])
     assert [int(value) if k else float(value) for k, value in enumerate(block.raw[0])] == [0.5, raw]
     assert block.raw.dtype == np.dtype(dtype)
+
+
+def test_a_test_pattern_has_no_value_and_counts_none_as_invalid() -> None:
+    plan = StreamPlan.for_channels(0, ((1, 2), (2, 2)), n=N, period=MS, kind=StreamKind.PERIODIC, test_pattern=True)
+    clock, now = ClockMap(), time.monotonic_ns()
+    clock.exchange(Exchange(now, now + 2000, 500, 1500, 1, 20))
+    heard = StreamInterpreter(SHEET, plan, 1, clock, HostClock(WallClock(1.8e9)), MonotonicStamps())
+    [block] = heard.blocks([message(0, (LOW, LOW), (HIGH, LOW), (LOW, LOW), flags=0x80)])
+    assert block.test_pattern
+    assert not block.valid.any()
+    assert np.isnan(block.value).all()
+    assert block.raw.tolist() == [[LOW, LOW], [HIGH, LOW], [LOW, LOW]]
+    assert heard.invalid == ()

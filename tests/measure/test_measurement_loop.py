@@ -19,7 +19,7 @@ from teds_provision.errors import (
     StoreError,
     TedsProvisionError,
 )
-from teds_provision.measure.blocks import SinkStats, StationFacts
+from teds_provision.measure.blocks import ChannelFacts, SinkStats, StationFacts
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running import measurement
 from teds_provision.measure.running.measurement import WAITING, Measurement
@@ -293,3 +293,49 @@ def test_who_holds_up_a_trigger_is_named_once_it_takes_long(monkeypatch: pytest.
     made.request = MeasurementRequest()
     made._trigger()
     assert pulled == ["pulled"]
+
+
+def facts(uuid: bytes, number: int, kind: str = "sensor", **more: Any) -> Any:
+    return ChannelFacts(uuid.hex(), "node", number, "channel", kind, period=0.5, **more)  # type: ignore[arg-type]
+
+
+def test_rows_have_every_sensor_and_begin_anew_only_if_something_is_described_otherwise() -> None:
+    """A node that comes back with the same datasheet costs the others no row."""
+    described: list[Any] = []
+    sink: Any = SimpleNamespace(wants_rows=True, describe=described.append)
+    made = measurement_of(supervisor_of(UUIDS[0]), supervisor_of(UUIDS[1]), sinks=[sink])
+    made._lock, made._known, made._grids = threading.Lock(), {}, {}
+    made._describe([facts(UUIDS[0], 2), facts(UUIDS[0], 1), facts(UUIDS[0], 3, "actuator")])
+    grid = made._grids[""]
+    assert (grid.channels, grid.group) == (((UUIDS[0].hex(), 1), (UUIDS[0].hex(), 2)), "all")
+    made._describe([facts(UUIDS[0], 2), facts(UUIDS[0], 1), facts(UUIDS[0], 3, "actuator")])
+    assert made._grids[""] is grid
+    made._describe([facts(UUIDS[0], 2, unit="m")])
+    assert made._grids[""] is not grid, "another datasheet"
+    made._describe([facts(UUIDS[1], 1, "event")])
+    assert [key[0] for key in made._grids[""].channels] == [UUIDS[0].hex()] * 2 + [UUIDS[1].hex()]
+    assert len(described) == 4, "a sink hears of each all the same"
+    sink.wants_rows, made._grids = False, {}
+    made._describe([facts(UUIDS[0], 1, unit="s")])
+    assert made._grids == {}
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_a_measurement_that_a_person_stops_early_reports_no_node_as_absent(
+    stopped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    absent = supervisor_of(UUIDS[0], start=lambda: None)
+    monkeypatch.setattr(measurement, "NodeSupervisor", lambda *_: absent)
+    monkeypatch.setattr(Measurement, "_loop", lambda *_: None)
+    monkeypatch.setattr(Measurement, "_end", lambda _: None)
+    made = measurement_of()
+    made.uuids, made.buses = UUIDS[:1], SimpleNamespace(expect=lambda _: None)
+    stop = threading.Event()
+    if stopped:
+        stop.set()
+    error = made.run(stop).error
+    if stopped:
+        assert error is None
+    else:
+        assert isinstance(error, NoNodeError)
+        assert "did not answer before the measurement ended" in error.message

@@ -266,3 +266,16 @@ def test_a_compensated_sample_is_valid_if_every_reading_that_it_takes_is(
     assert (found.channel, found.raw, found.valid, found.why) == (1, raws[1], not why, why)
     assert found.value == (None if why else pytest.approx(2.501, abs=1e-6))
     assert found.time == pytest.approx(7000.0 if lie else 1051.0, abs=1e-3)
+
+
+def test_the_text_of_a_raw_number_is_that_of_a_valid_one_and_only_a_full_turn_has_a_beginning() -> None:
+    def sampled(raw: int, *, good: bool, **facts: Any) -> Sample:
+        sheet = changed(SHEET, 2, value_table={0: "closed", 4095: "open", 5000: "never"}, **facts)
+        return sampling._sample(ChannelInterpreter(sheet, 2), {2: np.array([raw], dtype=np.uint64)}, {2: good}, 1.0)
+
+    assert [sampled(raw, good=True).text for raw in (0, 1, 4095, 5000)] == ["closed", "", "open", ""]
+    assert sampled(0, good=False).text == ""
+    assert sampled(0, good=True).turn is None
+    radians = parse_unit("rad").units
+    assert sampled(0, good=True, units=radians, low=-math.pi, high=math.pi).turn == -math.pi
+    assert sampled(0, good=True, units=radians, low=-math.pi, high=0.0).turn is None
