@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from teds_provision.arrays import NDArray
 from teds_provision.teds import Units
@@ -82,6 +82,10 @@ class ChannelFacts:
     def label(self) -> str:
         """Name for people: the channel's, else its number."""
         return self.name or f"channel {self.number}"
+
+
+ECHO: Final = 255
+"""Number of the "stream" for the echo of applied set points; nodes use 0 to 3."""
 
 
 @dataclass(frozen=True)

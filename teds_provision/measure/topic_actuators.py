@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NotAuthenticError, TedsProvisionError
-from teds_provision.measure.blocks import Block, SetPointCommand
+from teds_provision.measure.blocks import ECHO, Block, SetPointCommand
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.verified_session import LEASE, VerifiedSession, claim
 from teds_provision.protocol.messages.frames import Reason
@@ -36,7 +36,6 @@ from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 _log = logging.getLogger(__name__)
 DRIVE_ABOVE = 50  # set points a second
 WATCHED = 10  # set points over which their rate is computed
-ECHO = 255  # number of the "stream" for the echo of applied set points; nodes use 0 to 3
 
 
 @dataclass

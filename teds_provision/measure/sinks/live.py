@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from teds_provision.measure.blocks import (
+    ECHO,
     Block,
     ChannelFacts,
     ClockSet,
@@ -178,7 +179,10 @@ class TopicSink(ThreadedSink):
             self._facts.setdefault(channel_facts.uuid, {})[channel_facts.number] = channel_facts
 
     def write(self, block: Block) -> None:
-        """Queue samples of one stream; those before their topics are due are left out here."""
+        """Queue samples of one stream; those before their topics are due are left out here, but for set points."""
+        if block.stream == ECHO and self._joints_of.get(block.uuid):
+            super().write(block)
+            return
         if self._station.scalar_rate <= 0:
             return
         streams = self._scalars.get(block.uuid)
@@ -274,6 +278,8 @@ class TopicSink(ThreadedSink):
         }
 
     def _block(self, block: Block) -> None:
+        if block.stream == ECHO and len(block.time):
+            self._applied(block)
         rate = self._station.scalar_rate
         # A test pattern is not a measurement: recorders mark it, but topics cannot, so it is not published.
         if rate <= 0 or block.test_pattern or not len(block.time):
@@ -355,6 +361,18 @@ class TopicSink(ThreadedSink):
             self._array(f"{topic}/age", stamp, names, rows.age[k].tolist())
             self._went(int(np.isfinite(rows.value[k]).sum()), messages=2)
         self._arrays[rows.channels] = last
+
+    def _applied(self, block: Block) -> None:
+        """Take a set point that was applied; the state of a joint whose node sends no rows goes out with it."""
+        if not self._joints_of.get(block.uuid):
+            return
+        stamp, values = float(block.time[-1]), dict(zip(block.keys, block.value[-1].tolist(), strict=True))
+        group = block.uuid if self._station.each_node else self._station.group
+        if self._labels.get(group) or stamp - self._arrays.get(block.keys, -math.inf) < 1 / ROWS - 1e-6:
+            self._newest |= values
+        else:
+            self._arrays[block.keys] = stamp
+            self._joint_states(group, stamp, values)
 
     def _joint_states(self, group: str, stamp: float, values: Mapping[tuple[str, int], float]) -> None:
         self._newest |= values

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import (
+    ECHO,
     Block,
     ChannelFacts,
     GroupRows,
@@ -27,7 +28,7 @@ from teds_provision.measure.blocks import (
     why_invalid,
 )
 from teds_provision.measure.sinks import names
-from teds_provision.measure.sinks.base import LIVE_WAITING
+from teds_provision.measure.sinks.base import LIVE_WAITING, ROWS
 from teds_provision.measure.sinks.joints import joints_of, state_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.names import Topics, slug
@@ -385,10 +386,28 @@ def test_the_set_point_that_was_applied_is_the_state_of_a_joint_without_a_sensor
         value = np.array([[3.0]])
         return GroupRows(group if each_node else "crane", (key,), np.array([stamp]), value, 0 * value)
 
-    applied = replace(block([[7]], [[0.05]], uuid=HAND), stream=255)
+    applied = replace(block([[7]], [[0.05]], uuid=HAND), stream=ECHO)
     items = [row(1.0, HAND, (HAND, 2)), applied, row(2.0, ARM, (ARM, 1)), row(3.0, HAND, (HAND, 2))]
     sink = carried(items, facts=[ANGLE, actuator, warm], station=station)
     assert sink.joints == [(["hand"], [0.05], [], [])] * (1 if each_node else 2), "with the rows of its own node"
+
+
+@pytest.mark.parametrize("each_node", [False, True])
+@pytest.mark.parametrize("scalar_rate", [0.0, 50.0])
+def test_a_joint_of_a_node_without_sensors_has_its_state_with_each_set_point(
+    each_node: bool, scalar_rate: float
+) -> None:
+    """Such a node sends no rows, with which states went out; without scalars the set point was not even kept."""
+    actuator, *_ = gripper()
+    station = replace(STATION, each_node=each_node, scalar_rate=scalar_rate)
+
+    def applied(stamp: float, value: float) -> Block:
+        return replace(block([[7]], [[value]], uuid=HAND), stream=ECHO, time=np.array([stamp]))
+
+    sink = carried(
+        [applied(1.0, 0.05), applied(1.0 + 0.5 / ROWS, 0.06), applied(2.0, 0.07)], facts=[actuator], station=station
+    )
+    assert sink.joints == [(["hand"], [value], [], []) for value in (0.05, 0.07)], "not above the rate of rows"
 
 
 @pytest.mark.parametrize(
