@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from operator import itemgetter
 from typing import Any, Final
 
 from teds_provision.errors import NotFoundError, UsageError
@@ -196,8 +197,10 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
             if wanted and not uuid.hex().startswith(digits) and wanted not in name.lower():
                 continue
             holders = {} if seen.holder is None else seen.holder[1]
-            newest = max(
-                ((w[0], roster.name_of(fingerprint), w[2]) for fingerprint, w in seen.written.items()), default=None
+            newest = max(  # a machine that joined again may have the name of its removed self
+                ((w[0], roster.name_of(fingerprint), w[2]) for fingerprint, w in sorted(seen.written.items())),
+                key=itemgetter(0, 1),
+                default=None,
             )
             yield {
                 "uuid": uuid.hex(),

@@ -534,3 +534,34 @@ def test_a_key_that_is_trusted_as_a_ca_signs_no_datasheets_in_a_plant(station: S
     assert rules.added == {fingerprint(SoftwareKey(62).point)}
     verdicts = [rules.signing(station.ca, SoftwareKey(number).point, bytes(40)) for number in (61, 62)]
     assert [verdict is not None and verdict.result == "passed" for verdict in verdicts] == [False, True]
+
+
+def test_a_machine_that_joined_again_under_its_name_does_not_hide_who_wrote(station: Station) -> None:
+    """Both state one sequence, one of them without a profile; the view was a TypeError."""
+    (west,) = others(station, west="line sign")
+    old = SoftwareKey(6001)
+    left = RemovedMember("west", old.point, frozenset({"line", "sign"}), "retired", (1, H))
+    now = held(station, west, removed=(left,))
+    written = {west.fingerprint: (6, H, 1, None, None, None), fingerprint(old.point): (6, H, 1, "angle", None, None)}
+    for digits, what in written.items():
+        paged(station, digits, 1, "2026-03-01T12:00:00Z")
+        with station.transaction():
+            station.plant.claims.put(station.plant.pages.chain(digits).id, {NODE: Claim(written=what).to_json()})
+    [shown] = status.nodes(station, now)
+    assert (shown["says"]["sequence"], shown["says"]["written_by"]) == (6, "west")
+    assert status.find_named(station, NODE.hex()[:4]) == NODE
+    assert status.find_named(station, NODE.hex()[:3]) is None
+    assert status.find_named(station, " 0x8D4D9D ") == NODE
+    assert status.find_named(station, "no such name") is None
+    with station.transaction():
+        chain = station.plant.pages.chain(west.fingerprint).id
+        other = bytes.fromhex("8d4d9da65281f7000001")
+        palms = {NODE: Claim(name=("palm", "2026-03-01")), other: Claim(name=("palm left", "2026-03-01"))}
+        station.plant.claims.put(chain, {uuid: claim.to_json() for uuid, claim in palms.items()})
+    assert status.find_named(station, "palm") == NODE, "the whole name"
+    assert status.find_named(station, "pal") is None
+    with pytest.raises(UsageError, match="'8d4d' matches 2 nodes"):
+        status.find_named(station, "8d4d")
+    assert status.resolve(station, other.hex()) == other
+    with pytest.raises(NotFoundError, match="No node is known as 'elbow'"):
+        status.resolve(station, "elbow")
