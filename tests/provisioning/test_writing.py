@@ -9,10 +9,19 @@ from typing import Any
 import pytest
 
 from teds_provision import teds
-from teds_provision.errors import BadDataError, NodeSilentError, NotFoundError, PolicyError
+from teds_provision.errors import (
+    BadDataError,
+    GarbledError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotFoundError,
+    PolicyError,
+)
+from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning import write as writing
 from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.sign import SignOrder, sign_image
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
@@ -270,3 +279,71 @@ def test_which_image_is_written(station: Station, image: Image, tmp_path: Path) 
     file.write_text(Image(uuid, image.unsigned_blocks()).to_json())
     with pytest.raises(BadDataError, match=r"^The image has no Security TEDS\.$"):
         writing._wanted(station, uuid, file)
+
+
+class Tried(MockNode):
+    """A node whose stagings end like this, one after the other; ``reached``: the lost reply was that of a commit."""
+
+    def __init__(self, *ends: Exception | None, alive: bool = True, reached: bool = False) -> None:
+        super().__init__(alive=alive)
+        self.ends, self.reached, self.skips = list(ends), reached, list[int]()
+        self.opened = 0
+
+    def reopen(self) -> None:
+        self.opened += 1
+
+
+MISMATCH = NodeRefusedError("TEDS does not match its signed digest", reason=Reason.DIGEST_MISMATCH)
+FULL = NodeRefusedError("no room", reason=Reason.NO_ROOM)
+SILENT, TORN, LOST = NodeSilentError("silent"), GarbledError("torn"), SessionLostError(NodeSilentError("lost"))
+
+
+@pytest.mark.parametrize(
+    ("ends", "facts", "octets", "error", "skips", "opened"),
+    [
+        ((None,), {}, 7, None, [2], 0),
+        # what the store has of the node is out of date: all is sent, in the same session
+        ((MISMATCH, None), {}, 7, None, [2, 0], 0),
+        ((MISMATCH, MISMATCH), {}, 0, MISMATCH, [2, 0], 0),
+        ((FULL,), {}, 0, FULL, [2], 0),
+        # a frame is lost on a bus, a node is not
+        ((SILENT, None), {}, 7, None, [2, 2], 1),
+        ((TORN, None), {}, 7, None, [2, 2], 1),
+        ((SILENT,), {"alive": False}, 0, SILENT, [2], 0),
+        ((SILENT,), {"reached": True}, 0, None, [2], 1),
+        ((LOST, None), {"alive": False}, 7, None, [2, 2], 1),
+        ((LOST,), {"alive": False, "reached": True}, 0, None, [2], 1),
+        ((SILENT, SILENT, SILENT), {}, 0, SILENT, [2, 2, 2], 2),
+        ((LOST, LOST, LOST), {}, 0, LOST.cause, [2, 2, 2], 2),
+    ],
+)
+def test_a_write_that_is_cut_short_starts_over_or_was_done(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    ends: tuple[Exception | None, ...],
+    facts: dict[str, bool],
+    octets: int,
+    error: Exception | None,
+    skips: list[int],
+    opened: int,
+) -> None:
+    node: Any = Tried(*ends, **facts)
+    image = Image(bytes(10), BLOCKS)
+    has = Image(bytes(10), {(0, 1): BLOCKS[0, 1], (1, 3): BLOCKS[1, 3], (0, 12): b"another name", SECURITY: b"old"})
+
+    def staged(_station: object, node: Tried, _image: object, skip: set[Any], _progress: object) -> int:
+        node.skips.append(len(skip))
+        end = node.ends.pop(0)
+        if end is not None:
+            raise end
+        return 7
+
+    monkeypatch.setattr(writing, "_stage_and_commit", staged)
+    monkeypatch.setattr(writing, "read_block", lambda node, _block: BLOCKS[SECURITY] if node.reached else b"old")
+    if error is None:
+        assert writing._commit(station, node, image, has, None) == octets
+    else:
+        with pytest.raises(type(error)) as raised:
+            writing._commit(station, node, image, has, None)
+        assert raised.value is error
+    assert (node.skips, node.opened, node.ends) == (skips, opened, [])
