@@ -143,6 +143,29 @@ def test_the_status_of_a_busy_station(home: Path, running: Running) -> None:
     assert call(home, "--json", "ncap", "status").json["started"] == "2026-01-01T00:00:00.500Z"
 
 
+NOT_NOW = "not verified now (authentic when last read)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "shown"),
+    [
+        ({"problem": {"message": "It has another key."}}, f"{NOT_NOW}: It has another key."),
+        ({"heard": {"verdict": "authentic"}}, NOT_NOW),
+        ({"problem": {"message": "It is silent."}, "present": False}, "authentic: It is silent."),
+        ({"problem": {"message": "No reply."}, "measuring": {"state": "running"}}, "authentic: No reply."),
+        ({"problem": {"message": "No reply."}, "measuring": {"state": "waiting"}}, f"{NOT_NOW}: No reply."),
+    ],
+)  # fmt: skip
+def test_a_board_that_did_not_prove_itself_is_not_shown_as_authentic(
+    home: Path, running: Running, changes: dict[str, Any], shown: str
+) -> None:
+    """A board with another key under a known UUID stood there as authentic, with the reason behind it."""
+    running.found = {"station": {"name": "hall"}, "detection": "whitelist", "url": None, "links": [link("can:x")]}
+    running.shown = [node(A, "arm", **changes)]
+    line = call(home, "ncap", "status").out.splitlines()[-1]
+    assert line.split("  ", 3)[-1] == shown
+
+
 def test_the_status_without_page_and_links(home: Path, running: Running) -> None:
     running.found = {"station": {"name": "hall"}, "detection": "transparent", "url": None, "links": [
         link("virtual", virtual=True, nodes=0)]}  # fmt: skip

@@ -165,6 +165,12 @@ def test_each_verdict_has_its_tone_its_word_and_its_meaning(stage: Stage) -> Non
             ({"verdict": "authentic", **absent, "read": YESTERDAY}, ["plain", "good", "Authentic on 2026-11-24"]),
             ({"verdict": "authentic", **absent, "read": NONE}, ["plain", "good", "Authentic"]),
             ({"verdict": "authentic", **absent, "present": True}, ["good", "good", "Authentic"]),
+            ({"verdict": "authentic", "present": True, "problem": {}}, ["warn", "ask", "Not verified"]),
+            (
+                {"verdict": "authentic", "present": True, "problem": {}, "measuring": {"state": "running"}},
+                ["good", "good", "Authentic"],
+            ),
+            ({"present": True, "problem": {}}, ["plain", "ask", "Not checked"]),
         ],
     )  # fmt: skip
     meanings = stage.run(

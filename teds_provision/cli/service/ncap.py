@@ -330,8 +330,13 @@ def _verdict(node: dict[str, Any]) -> str:
         return "not verified yet"
     if node.get("unverified"):
         return "unverified (its datasheet is not signed)"
+    verdict = node["verdict"]["verdict"]
+    running = node["measuring"] is not None and node["measuring"]["state"] == "running"
+    if node["present"] and not running and (node["problem"] or node.get("heard")):
+        # what answers there now opened no session, so it may be another board under this UUID
+        return f"not verified now ({verdict} when last read)"
     kept = " (stored copy, except the Security TEDS)" if node["verdict"]["from"] == "kept" else ""
-    return f"{node['verdict']['verdict']}{kept}"
+    return f"{verdict}{kept}"
 
 
 def _link(link: dict[str, Any]) -> str:

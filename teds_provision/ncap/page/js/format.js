@@ -144,6 +144,9 @@ function dated(time) {
 /** Tone, icon, word and meaning of the verdict on a node or a datasheet; for an absent node in grey, with its time. */
 export function verdict(of) {
   const [tone, sign, words, why] = judged(of);
+  // what is there now was not read, so it may be another board under this UUID
+  const unproven = of.present && of.measuring?.state !== "running" && of.problem;
+  if (unproven && tone !== "plain") return ["warn", "ask", "Not verified", `It has not proven itself since it came. Last verdict${dated(of.read?.at)}: ${words}.`];
   if (of.present !== false || tone === "plain") return [tone, sign, words, why];
   return ["plain", sign, `${words}${dated(of.read?.at)}`, `${why} The node is not connected now.`];
 }
