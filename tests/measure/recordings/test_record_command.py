@@ -165,6 +165,29 @@ def test_what_info_prints_of_a_recording(tmp_path: Path) -> None:
     assert call(home, "record", "info", str(empty)).out.splitlines()[1] == "It contains no values."
 
 
+CHUNK, MAGIC_OCTETS, HEAD_OCTETS = 6, 8, 9
+
+
+def end_of_last_chunk(octets: bytes) -> int:
+    """Return where the last chunk of an MCAP file ends: each record has an opcode, a length (u64) and its octets."""
+    place, end = MAGIC_OCTETS, 0
+    while place < len(octets) - MAGIC_OCTETS:
+        opcode, length = octets[place], int.from_bytes(octets[place + 1 : place + HEAD_OCTETS], "little")
+        place += HEAD_OCTETS + length
+        end = place if opcode == CHUNK else end
+    return end
+
+
+@pytest.mark.parametrize(("more", "words"), [(0, ""), (5, ", and the last 5 octets are incomplete")])
+def test_what_info_prints_of_a_file_that_was_cut_behind_a_chunk(tmp_path: Path, more: int, words: str) -> None:
+    path = recorded(tmp_path / "run.mcap", [block(), block(index=3)])
+    octets = path.read_bytes()
+    path.write_bytes(octets[: end_of_last_chunk(octets) + more])
+    printed = call(tmp_path / "home", "record", "info", str(path)).out.splitlines()
+    assert printed[2] == "6 time stamps, 6 values, 0 invalid; lost: not recorded, missing: 0 samples"
+    assert printed[3] == f"It was cut off: no end was written{words}."
+
+
 def test_a_file_that_may_not_grow_ends_a_conversion_with_words_and_leaves_nothing(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 15_000, 3)])
     program = f"{sys.executable} -m teds_provision record convert {source} {tmp_path / 'to.csv'}"
