@@ -15,7 +15,6 @@ from teds_provision.errors import ForkError, NotMemberError, PolicyError, Regist
 from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.postgres import Registry, parameters
 from teds_provision.plant.schema import close_sql
-from teds_provision.plant.scram import password
 from tests.pace import PATIENCE
 from tests.plant.postgres import Database, Login, own_cluster
 from tests.plant.relay import Relay, relay
@@ -174,33 +173,6 @@ def test_a_url_says_only_where_the_registry_is(url: str) -> None:
     with pytest.raises(UsageError) as refused:
         parameters(url, "ab" * 32, bytes(32))
     assert "secret" not in refused.value.message
-
-
-def test_what_a_station_asks_of_libpq() -> None:
-    """All of it, as each line keeps a station from a wrong server, a wrong row or a wait without end."""
-    url = "postgresql://db.plant.example:5433/plant?sslrootcert=/etc/root.crt"
-    asked = parameters(url, "ab" * 32, bytes(32))
-    assert asked.pop("password") == password(bytes(32))
-    assert asked == {
-        "host": "db.plant.example",
-        "port": "5433",
-        "dbname": "plant",
-        "sslrootcert": "/etc/root.crt",
-        "user": "teds_" + "ab" * 8,
-        "sslmode": "verify-full",
-        "ssl_min_protocol_version": "TLSv1.3",
-        "channel_binding": "require",
-        "gssencmode": "disable",
-        "target_session_attrs": "read-write",
-        "connect_timeout": 10,
-        "tcp_user_timeout": 10_000,
-        "keepalives_idle": 10,
-        "keepalives_interval": 5,
-        "keepalives_count": 3,
-        "application_name": "teds-provision",
-        "client_encoding": "UTF8",
-        "options": "-c statement_timeout=60s -c lock_timeout=10s -c idle_in_transaction_session_timeout=60s",
-    }
 
 
 def test_the_environment_takes_nothing_back(login: Login, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ VERIFIER = "SCRAM-SHA-256$4096:" + "A" * 22 + "==$" + "B" * 43 + "=:" + "C" * 43
 
 
 def test_a_login_is_the_stations_own_over_tls_1_3_bound_to_its_channel_and_waits_for_nothing_long() -> None:
+    """All of it, as each line keeps a station from a wrong server, a wrong row or a wait without end."""
     secret = bytes(range(32))
     assert postgres.parameters("postgresql://office:5433/plant?sslrootcert=/etc/office.crt", STATION, secret) == {
         "host": "office",
