@@ -101,23 +101,24 @@ class TextRecording(Recording):
     def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""
         yield tuple(self._known)
-        streams, waiting, headed = Streams(), list[str](), False
+        streams, waiting, headed, first = Streams(), list[str](), False, 0  # ``first``: line of the first waiting row
         for line in self._lines():
             if line.startswith("#"):
                 if waiting:
-                    yield from self._rows(waiting, streams)
+                    yield from self._rows(waiting, first, streams)
                     waiting = []
                 if entry := self._commented(line):
                     yield entry
             elif headed:
+                first = first if waiting else self._line
                 waiting.append(line)
                 if len(waiting) >= ROWS:
-                    yield from self._rows(waiting, streams)
+                    yield from self._rows(waiting, first, streams)
                     waiting = []
             else:
                 headed = True
         if waiting:
-            yield from self._rows(waiting, streams)
+            yield from self._rows(waiting, first, streams)
 
     def _commented(self, line: str) -> Entry | None:
         timed = _TIMED.match(line)
@@ -133,12 +134,12 @@ class TextRecording(Recording):
         why = _reason(state[8][: 4 * MOST.text])[: MOST.text]
         return NodeReport(state[1], named[state[2]], why, samples, lost, late, bad, invalid, time=unix_of(timed[1]))
 
-    def _rows(self, lines: Sequence[str], streams: Streams) -> Iterator[Entry]:
+    def _rows(self, lines: Sequence[str], first: int, streams: Streams) -> Iterator[Entry]:
+        """Yield the blocks of rows, the first of which is line ``first`` of the file."""
         table = [line.split(self._comma) for line in lines]
-        first = self._line - len(lines)
         for place, cells in enumerate(table):
             if len(cells) != self._width:
-                self._line = first + place + (1 if self._width else 0)
+                self._line = first + place
                 raise self._bad(f"the row has {len(cells)} cells in place of {self._width}")
         try:
             if self.wide:

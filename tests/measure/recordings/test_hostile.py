@@ -52,7 +52,7 @@ def refused(path: Path, *words: str) -> None:
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,3,4,5,6\n", [":3:", "6 cells"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,x,4,5\n", ["no number"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,9999999999999999999,4,5\n",
-         [":2:", "too large"]),
+         [":3:", "too large"]),
         (b"# teds-provision measurement, text 1\n\xff\xfe\n", [":2:", "UTF-8"]),
         (b"# teds-provision measurement, text 1\n" + b"1" * (9 << 20), [":2:", "more than 8388608 octets"]),
     ],
