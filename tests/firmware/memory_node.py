@@ -135,6 +135,11 @@ class MemoryNode:
         self._now()
         return int(self._library.memory_restart(self._board)) if self._library.memory_restarts(self._board) else None
 
+    def bus_off(self) -> None:
+        """Its controller went off the bus, and is back."""
+        self._now()
+        self._library.memory_bus_off(self._board)
+
     def press(self) -> None:
         """A button is released that was held for a short time."""
         self._now()

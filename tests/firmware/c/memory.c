@@ -763,6 +763,12 @@ void memory_lost(memory_board *board, uint8_t link)
     teds_node_link_lost(&board->node, link);
 }
 
+void memory_bus_off(memory_board *board)
+{
+    teds_node_bus_off(&board->node);
+    teds_can_start(&board->node, board->now);
+}
+
 void memory_move(memory_board *board, uint8_t address)
 {
     teds_address_move(&board->node, address);

@@ -122,6 +122,8 @@ void memory_fixed(memory_board *board, uint8_t channel, uint8_t code, const uint
 /* Its controller is on the bus; after a start. */
 void memory_can_start(memory_board *board);
 void memory_lost(memory_board *board, uint8_t link);
+/* Its CAN controller is off the bus, and comes back. */
+void memory_bus_off(memory_board *board);
 void memory_move(memory_board *board, uint8_t address);
 int memory_by_hand(memory_board *board);
 void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd);

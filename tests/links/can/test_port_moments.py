@@ -60,7 +60,6 @@ class MockPort(CanPort):
         return found
 
     def _ask_all(self, bus: object, transaction: int, *, silence: float, longest: float) -> Iterator[Any]:
-        assert transaction == len(self.asked)
         self.asked.append((round(self.now - 100, 2), round(silence, 2), round(longest, 2)))
         found = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
         for address, identity in found.identities.items():
@@ -166,7 +165,7 @@ def test_what_began_and_did_not_end_is_asked_alone(port: MockPort) -> None:
 
 
 def test_everyone_is_listened_for_at_least_as_long_as_asked_and_shown_once(port: MockPort) -> None:
-    port.answers = [answers(5), answers(6, 5)]
+    port.answers = [answers(5), answers(6)]
     assert port.lists(5.0, listen=3.0) == ([5, 6], [5, 6])
     assert port.asked[0] == (0.0, 1.5, 3.0)
     assert [round(silence, 1) for _, silence, _ in port.asked] == [1.5, 1.5]
@@ -206,6 +205,20 @@ def test_eight_nodes_or_more_are_asked_again_until_no_new_one_answers_three_time
     assert len(port.asked) == questions
     assert found == sorted({node for one in rounds[:questions] for node in one.identities})
     assert {silence for _, silence, _ in port.asked[1:]} <= {0.3}
+
+
+def test_of_many_the_rounds_after_the_first_need_no_patience(port: MockPort) -> None:
+    port.answers = [answers(*range(1, 9))]
+    port.lists(5.0, listen=1.6)
+    assert [silence for _, silence, _ in port.asked] == [1.5, 0.3]
+
+
+def test_another_station_at_our_address_is_named_once(port: MockPort) -> None:
+    port.rivals, port.answers = True, [FunctionalAnswers(), answers(5)]
+    assert port.seeks(5) == 5
+    port.answers = [FunctionalAnswers(), answers(5)]
+    assert port.seeks(5) == 5
+    assert port.kinds() == ["conflict"]
 
 
 def test_what_is_unclear_is_named_once_and_a_conflict_ends_the_list(port: MockPort) -> None:
