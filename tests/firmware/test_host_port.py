@@ -181,6 +181,10 @@ def test_its_identity_key_may_lie_in_psa_and_never_leave_it(desk: Desk, station:
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
     fingerprint = node.ready["fingerprint"]
     node.kill()
+    [kept] = desk.folder.glob("*.psa_its")  # as Mbed TLS stores a key: after two headers its type, bits and usage
+    usage = int.from_bytes(kept.read_bytes()[36:40], "little")
+    assert usage & 0x1000, "PSA_KEY_USAGE_SIGN_HASH"
+    assert not usage & ~0x1400, "and nothing beyond signing: not PSA_KEY_USAGE_EXPORT (1), COPY (2), DERIVE (0x4000)"
     node.start(cwd=desk.folder)
     assert node.ready["fingerprint"] == fingerprint
     assert station.ask("verify", node.uuid, *links)["verdict"] == "authentic"

@@ -184,6 +184,15 @@ def test_a_run_of_drive_that_was_used_before_is_refused() -> None:
     scene.actuators.close()
 
 
+def test_a_refusal_is_a_clause_without_a_full_stop() -> None:
+    scene = Scene(lambda: refusal(Reason.WRONG_STATE))
+    for why in ("channel 1: 0.2 m is above 0.11 m.", "channel 1: 0.2 m is above 0.11 m"):
+        scene.actuators._refuse(why)
+    scene.actuators.close()
+    assert scene.warnings == ["set point refused, channel 1: 0.2 m is above 0.11 m"] * 2
+    assert scene.actuators.refused == 2
+
+
 def test_a_bug_with_one_set_point_is_reported_and_the_next_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """The thread ended without a word, and the actuator followed no topic any more until the session was over."""
     scene, sent = Scene(lambda: reply(1)), scene_send(monkeypatch)

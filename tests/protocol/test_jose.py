@@ -226,6 +226,9 @@ def protected(**changes):
 def test_only_recipients_can_open_it(receivers):
     keys = [SoftwareKey(1000 + number) for number in range(receivers)]
     octets = jose.encrypt(PAYLOAD, [key.point for key in keys], cty="JWS")
+    header = jose.read_header(octets, max_octets=LIMIT)
+    assert (header.algorithm, header.encryption, header.content_type) == ("ECDH-ES+A256KW", "A256GCM", "JWS")
+    assert header.recipients == tuple(fingerprint(key.point) for key in keys)
     assert all(opened(octets, key) == PAYLOAD for key in keys)
     with pytest.raises(PolicyError, match="not sealed for this station"):
         opened(octets, STRANGER)

@@ -92,7 +92,8 @@ def test_a_teds_that_the_node_could_never_hold_gets_18(channel: int, code: int) 
 
 def test_read_past_the_end_gives_the_length_and_no_octets() -> None:
     size = len(Desk().flash.security_teds())
-    assert Desk().plain(read_teds(0, 128, size + 9)).payload == size.to_bytes(4, "big")
+    for offset in (size, size + 9, 0xFFFF, 0x10000, 0x1_0010, 0xFFFF_FFFF):  # all 32 bits of it count
+        assert Desk().plain(read_teds(0, 128, offset)).payload == size.to_bytes(4, "big")
 
 
 def test_list_names_every_teds_ascending() -> None:
@@ -113,7 +114,8 @@ def test_segments_build_the_image_and_drop_what_lay_behind(desk: Desk) -> None:
 
 def test_a_gap_gets_4_and_changes_nothing(desk: Desk) -> None:
     assert desk.sealed(write_teds(1, 12, 0, NAME)).ok
-    assert desk.sealed(write_teds(1, 12, len(NAME) + 1, b"x")) == refusal(Reason.BAD_FORM)
+    for offset in (len(NAME) + 1, 0x10000, 0x10000 + len(NAME), 0xFFFF_FFFF):  # all 32 bits of it count
+        assert desk.sealed(write_teds(1, 12, offset, b"x")) == refusal(Reason.BAD_FORM), offset
     assert desk.sealed(update_teds(1, 12)).ok
 
 

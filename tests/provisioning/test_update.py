@@ -33,6 +33,7 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
+from teds_provision.protocol.session import NodeSession
 from teds_provision.provisioning import image_manager, update
 from teds_provision.provisioning.agree import reset_node
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
@@ -42,6 +43,7 @@ from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.update import UpdateOrder, plan_update, update_at
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
+from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.image import SECURITY
 from tests.bench import PASSPHRASE
 
@@ -64,6 +66,7 @@ def test_a_new_image_is_proven_kept_and_nothing_else_changes(bench: UpdateBench,
     flash = bench.node.tim.flash
     done = bench.update(owner.new)
     assert (done.result, done.before, done.octets, done.error) == ("updated", "1.0.0", len(owner.new.octets), None)
+    assert bench.details["upload"] == f"{len(owner.new.octets)} octets"
     assert bench.runs == ("1.1.0", False, False)
     assert bench.node.tim.flash == flash
     exchanges = bench.exchanges
@@ -236,6 +239,7 @@ def test_a_board_that_lost_power_on_trial_runs_its_old_image_and_takes_the_new_o
     assert bench.runs == ("1.0.0", False, False)
     done = bench.update(owner.new)
     assert (done.result, done.octets) == ("updated", 0), "the image is in the other slot already"
+    assert bench.details["upload"] == "already on the board"
 
 
 @pytest.mark.parametrize(
@@ -286,6 +290,32 @@ def test_an_image_that_does_not_prove_itself_is_reverted(
         assert "keeps the new image" in str(done.error)
         return
     assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.0.0", False, False)
+
+
+def test_a_resumed_update_compares_the_datasheet_with_the_one_of_the_store(bench: UpdateBench, owner: Owner) -> None:
+    """The station was killed as the board restarted: what the new image shows now was never seen under the old one."""
+    node, flash, slots = bench.node, bench.node.tim.flash, bench.node._slots
+    assert slots is not None
+    body = unframe(flash.blocks[SECURITY])
+    other = {**flash.blocks, SECURITY: frame(body[:-1] + bytes([body[-1] ^ 1]))}  # it can be read as well
+
+    def spoil() -> None:
+        node.tim._flash = replace(flash, blocks=other) if slots.running.version_text == "1.1.0" else flash
+
+    def cut(_number: int) -> None:
+        if slots.running.version_text == "1.1.0":
+            raise StationKilledError
+
+    bench.node.when_restarted(spoil)
+    bench.cut = cut
+    with pytest.raises(StationKilledError):
+        bench.update(owner.new)
+    assert bench.runs == ("1.1.0", True, False)
+    bench.cut = lambda _number: None
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert "shows another datasheet" in str(done.error)
     assert bench.runs == ("1.0.0", False, False)
 
 
@@ -422,22 +452,19 @@ def test_losses_count_from_the_last_piece_that_arrived(monkeypatch: pytest.Monke
 # -- hostile boards and a hostile bus ----------------------------------------------------------------------------------
 
 
-class HostileManager:
-    """The manager of a board whose replies to uploads a test replaces; all else is the real one's."""
+class HostileBoard:
+    """A board whose replies to uploads a test replaces, past the filter; all else is the real one's."""
 
     def __init__(self, bench: UpdateBench, reply: Callable[[SmpPacket, int], bytes]) -> None:
         manage = bench.node.tim._manage
         assert manage is not None
-        self._real, self._reply, self.uploads = manage._manager, reply, 0
-        manage._manager = self  # type: ignore[assignment]
+        self._run, self._reply, self.uploads = manage.run, reply, 0
+        manage.run = self.run  # type: ignore[method-assign]
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._real, name)
-
-    def manage(self, octets: bytes) -> bytes:
+    def run(self, octets: bytes, session: NodeSession, link: str) -> bytes:
         packet = decode_packet(octets)
         if packet.command != UPLOAD:
-            return self._real.manage(octets)
+            return self._run(octets, session, link)
         self.uploads += 1
         assert self.uploads < 50, "the station follows a board that never takes the image"
         return self._reply(packet, self.uploads)
@@ -509,13 +536,13 @@ HOSTILE: dict[str, tuple[Callable[[SmpPacket, int], bytes], type[Exception], int
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_a_board_that_answers_nonsense_ends_the_update_soon(bench: UpdateBench, owner: Owner, hostile: str) -> None:
     reply, error, most = HOSTILE[hostile]
-    manager = HostileManager(bench, reply)
+    board = HostileBoard(bench, reply)
     image = owner.long
     if hostile == "other octets than were sent":
-        manager._reply = reply_with(off=len(image.octets), match=False)
+        board._reply = reply_with(off=len(image.octets), match=False)
     done = bench.update(image)
     assert (done.result, type(done.error)) == ("refused", error), done.error
-    assert manager.uploads <= most
+    assert board.uploads <= most
     assert bench.runs == ("1.0.0", False, False)
 
 
@@ -524,7 +551,7 @@ def test_a_board_that_has_more_octets_than_were_sent_has_not_taken_the_image(
     bench: UpdateBench, owner: Owner, more: int
 ) -> None:
     length = len(owner.long.octets)
-    HostileManager(bench, reply_with(off=length + more))
+    HostileBoard(bench, reply_with(off=length + more))
     done = bench.update(owner.long)
     assert isinstance(done.error, NotAuthenticError)
     assert done.error.message == (f"The board reports {length + more} of {length} octets received, which cannot be.")
@@ -567,9 +594,9 @@ def test_a_recorded_update_cannot_be_played_again_and_without_the_key_there_is_n
     assert bench.update(owner.new).result == "updated"
     assert bench.update(owner.old, allow_downgrade=True).result == "updated"
     before = bench.runs
-    for frame in frames:
-        if frame[3] in (Function.SEALED, Function.OPEN):
-            bench.node.request("can:f1", frame, tapped=False)
+    for recorded in frames:
+        if recorded[3] in (Function.SEALED, Function.OPEN):
+            bench.node.request("can:f1", recorded, tapped=False)
     plain = security_command(Function.MANAGE, bytes.fromhex("0a00000100000705a0"))
     assert bench.node.request("can:f2", plain.encode(), tapped=False) == refusal(Reason.NOT_PERMITTED).encode()
     assert bench.runs == before

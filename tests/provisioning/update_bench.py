@@ -22,7 +22,7 @@ from teds_provision.provisioning import update as update_step
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.operator import AcceptingOperator
-from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.progress import SilentReporter, StepResult
 from teds_provision.provisioning.provision import provision
 from teds_provision.provisioning.update import BoardUpdate, UpdateOrder, update_boards
 from teds_provision.station.station import Station
@@ -57,9 +57,23 @@ class Owner:
         return load_firmware_image(sign(self.folder, version, key or self.key, **more))
 
 
+class _Steps(SilentReporter):
+    """A reporter that keeps the detail of each finished step, the last one of a name."""
+
+    def __init__(self, details: dict[str, str]) -> None:
+        self._details = details
+
+    def finished(self, step: StepResult) -> None:
+        """Note what a person would read."""
+        self._details[step.name] = step.detail
+
+
 @dataclass
 class UpdateBench:
-    """A node in ``folder``/node and a station. ``cut`` is called before each exchange with its number, from 1."""
+    """A node in ``folder``/node and a station. ``cut`` is called before each exchange with its number, from 1.
+
+    ``details`` holds what an update printed of each of its steps, by name.
+    """
 
     folder: Path
     station: Station
@@ -70,6 +84,7 @@ class UpdateBench:
     changed: Callable[[bytes, bytes], bytes] = lambda request, reply: reply
     exchanges: int = 0
     present: bool = True
+    details: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.power_on()
@@ -114,7 +129,7 @@ class UpdateBench:
                 self.station,
                 LinkSettings("can", via_chosen=True),
                 [(self.uuid, UpdateOrder(image, **{"wait": 5.0, **order}))],
-                lambda uuid: SilentReporter(),
+                lambda uuid: _Steps(self.details),
             )
         return done
 

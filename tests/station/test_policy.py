@@ -124,6 +124,20 @@ def test_trust_that_another_program_changed_is_reported_and_does_not_count(
     assert [row[0] for row in station.policy.mac_rows()] == [f"trust in {each}" for each in sorted([name, "south"])]
 
 
+def test_every_trusted_key_that_another_program_changed_is_named_up_to_five(
+    station: Station, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(station.policy, "_notify", told.append)
+    for number in range(7):
+        station.policy.trust(trusted(f"s{number}", SoftwareKey(700 + number).point))
+    for some, named in (("s0", "s0"), ("s3", "s0, s3"), ("s%", "s0, s1, s2, s3, s4")):
+        store.execute(f"UPDATE trust SET mac = NULL WHERE name LIKE '{some}'")
+        station.policy.unlocked()
+        assert told.pop() == f"Trust in {named} was changed by another program and does not count."
+    assert not [record for record in station.policy.trusted() if record.name.startswith("s")]
+
+
 def test_decisions_that_another_program_wrote_do_not_count(
     station: Station, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

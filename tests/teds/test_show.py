@@ -17,6 +17,7 @@ from teds_provision.teds.show import describe, hexadecimal, instant, seconds, sh
 VECTORS = sorted((Path(__file__).parent.parent / "vectors" / "ieee1451").glob("*.hex"))
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 KELVIN = Units(kelvins=1)
+PASCAL = Units(kilograms=1, meters=-1, seconds=-2)
 
 
 def shown_of(code, fields, **more):
@@ -88,6 +89,25 @@ def test_calibration_limits_are_in_the_calibrated_unit_if_the_channel_is_given()
     summary = dict(shown.summary)
     assert summary["method"] == "linear: 1 segment of degree 1"
     assert summary["due"] == "2020-12-31 (overdue)"
+
+
+def test_calibration_limits_in_another_unit_than_the_channel_has():
+    channel = teds.compose(3, {"PhyUnits": PASCAL, "LowLimit": 0.0, "HiLimit": 2e6})
+    calibration = teds.compose(
+        5,
+        [
+            ("LstCalDt", TimeInstance(1_577_836_800)),
+            ("CalInrvl", TimeInstance(31_536_000)),
+            ("SIConvrt", {"Slope": 1e5, "Intercept": 0.0}),
+            ("LowLimit", 0.0),
+            ("HiLimit", 16.0),
+            ("CalInput", {"ChanNum": 1, "ChanKey": 0, "Degree": 1, "Boundaries": (0.0, 100.0), "Offsets": (0.0,)}),
+            ("Coefs", (0.0, 0.16)),
+            ("Method", 0),
+        ],
+    )
+    text = texts(describe(TedsBlock(1, 5, calibration), {(1, 3): channel, (1, 5): calibration}, now=NOW))
+    assert (text["LowLimit"], text["HiLimit"]) == ("0 bar", "16 bar")
 
 
 def test_a_place_that_the_tedsid_denies_is_named():

@@ -48,6 +48,19 @@ def test_a_python_that_was_named_and_has_no_rclpy_is_refused(monkeypatch: pytest
         open_sink("ros2")
 
 
+def test_the_python_that_was_named_comes_before_the_one_that_runs_this(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both could: this one has rclpy as well."""
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    asked: list[str] = []
+    monkeypatch.setattr(sourced, "find_spec", lambda _name: object())
+    monkeypatch.setattr(sourced, "_require_rclpy", asked.append)
+    monkeypatch.setenv(sourced.CHOSEN, "/opt/python-with-rclpy")
+    assert sourced.ros2_sink("ros2")._python == "/opt/python-with-rclpy"  # type: ignore[attr-defined]
+    monkeypatch.delenv(sourced.CHOSEN)
+    assert sourced.ros2_sink("ros2")._python == sys.executable  # type: ignore[attr-defined]
+    assert asked == ["/opt/python-with-rclpy", sys.executable]
+
+
 def ports_of(process: int) -> list[str]:
     """Local addresses of the UDP sockets of a process, as ``ss`` tells them: ``0.0.0.0%lo:7410``."""
     output = subprocess.run(["ss", "-Hulpn"], capture_output=True, text=True, check=True).stdout
