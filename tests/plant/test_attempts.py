@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from teds_provision.plant import status
 from teds_provision.plant.yield_stats import UNREPORTED, StationYield, attempts_of
 from teds_provision.protocol.plant.roster import RemovedMember
 from teds_provision.station.plant.line import EvidenceRow, SignRequestRow, UnitRow
@@ -135,3 +136,29 @@ def test_what_an_office_signed_counts_until_the_line_reports(station: Station) -
 @pytest.mark.parametrize(("units", "over"), [(2, False), (3, False), (4, True)])
 def test_a_station_is_over_its_allotment_beyond_it(units: int, over: bool) -> None:
     assert StationYield("ab" * 32, "west", 3, units).over is over
+
+
+def test_which_events_the_log_of_the_registry_gives(station: Station) -> None:
+    west, south = others(station, west="line", south="line")
+    held(
+        station, south, removed=(RemovedMember("west", west.point, frozenset({"line"}), "lost", (1, f"{1:064x}")),)
+    )  # fmt: skip
+    page(station, west.fingerprint, 1, said(1, A), {"act": "no such act"}, said(2, B))
+    page(station, west.fingerprint, 2, said(3, A))
+    page(station, south.fingerprint, 1, said(4, A))
+
+    def given(**choice: Any) -> list[tuple[str, int, bool, int]]:
+        return sorted((one.station, one.number, one.counts, one.event["unit"]) for one in status.log(station, **choice))
+
+    of_west = [
+        (west.fingerprint, 1, True, 1), (west.fingerprint, 1, True, 2), (west.fingerprint, 2, False, 3)
+    ]  # fmt: skip
+    of_south = [(south.fingerprint, 1, True, 4)]
+    assert given() == sorted([*of_west, *of_south]), "each with whether its page counts"
+    assert given(of=west.fingerprint) == of_west
+    assert given(of=south.fingerprint) == of_south
+    assert given(uuid=B) == [of_west[1]]
+    assert given(uuid=A, of=west.fingerprint) == [of_west[0], of_west[2]]
+    assert given(since=AT) == given()
+    assert given(since="2026-01-31T12:00:01Z") == []
+    assert [one.number for one in status.log(station, of=west.fingerprint)] == [1, 1, 2], "in the order of the pages"
