@@ -5,6 +5,62 @@ from __future__ import annotations
 from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
+    Pattern(
+        "job status reads pages that count alone",
+        "_of_pages",
+        "(page.n, page.hash) not in counted",
+        "False",
+        "tests/plant/test_attempts.py",
+    ),
+    Pattern(
+        "two stations of one name wrote the same sequence",
+        "nodes",
+        "itemgetter(0, 1)",
+        "None",
+        "tests/plant/test_contract_states.py",
+    ),
+    Pattern(
+        "a hint of firmware needs no seal",
+        "FirmwareReports._counts",
+        "not record.in_session or self._row_macs.counts(record.mac, 'firmware', _bound(record))",
+        "self._row_macs.counts(record.mac, 'firmware', _bound(record))",
+        "tests/station/test_seals.py",
+    ),
+    Pattern(
+        "a hint of firmware becomes no report of a session",
+        "_bound",
+        "str(int(record.in_session))",
+        "None",
+        "tests/station/test_seals.py",
+    ),
+    Pattern(
+        "no sign of a text stands for another in the log",
+        "_like",
+        "plain.replace(sign, f'!{sign}')",
+        "plain",
+        "tests/station/test_audit_filters.py",
+    ),
+    Pattern(
+        "another master key of the same number is not accepted",
+        "Station.accept_masters",
+        "any(here[number] != masters.keys[number] for number in common)",
+        "False",
+        "tests/station/test_seals.py",
+    ),
+    Pattern(
+        "a ban of another station is carried out by revoke",
+        "already_revoked",
+        "present is None or station.keys.held(uuid) or station.pins.entry(uuid) is not None",
+        "present is None or station.pins.entry(uuid) is not None",
+        "tests/handover/test_life_rules.py",
+    ),
+    Pattern(
+        "a search by due names the day itself",
+        "_terms",
+        "'n.due <= ?'",
+        "'n.due < ?'",
+        "tests/station/test_overview.py",
+    ),
     # stores, vaults, handovers and registries: whose word counts, and clocks that were ahead
     Pattern(
         "a statement is held against the key that a bundle brings",
