@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +17,8 @@ from teds_provision.measure.planning import BusShare, BusTime, plan_node
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.names import Topics
 from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
 
 
 def test_an_expression_is_terms_that_must_all_hold() -> None:
@@ -254,3 +257,79 @@ def test_a_node_that_was_adopted_while_it_was_measured_is_measured_on_once_it_is
     if listed:
         adopted.add(ARM)  # the list grows while it is used
     assert nodes.why_not(station_of(), ARM) == why
+
+
+def test_a_node_whose_type_was_never_named_is_of_the_type_that_its_datasheet_fits(tmp_path: Path) -> None:
+    """As after an adoption. What is no name of a profile is none, whatever files there are."""
+    (tmp_path / "profiles").mkdir()
+    (tmp_path / "profiles" / "damaged.toml").write_text("title = ")
+    images = {LEG: Image(LEG, load_profile("gripper").build(LEG).blocks), ARM: Image(ARM, {})}
+    station = station_of(
+        nodes=SimpleNamespace(get=lambda _: None), datasheets=SimpleNamespace(datasheet=images.get), home=tmp_path
+    )
+    unknown = "its type is unknown, and its datasheet does not fit "
+    for kind, uuid, why in (
+        ("gripper", LEG, ""),
+        ("load-cell", LEG, f"{unknown}load-cell: its channels are 1, 2, 3, not 1"),
+        ("gripper", ARM, f"{unknown}gripper: none is known"),
+        ("gripper", BARE, f"{unknown}gripper: none is known"),
+        ("no-such-type", LEG, f"{unknown}no-such-type: there is no profile no-such-type"),
+        ("damaged", LEG, f"{unknown}damaged: there is no profile damaged"),
+        ("../profiles/damaged", LEG, f"{unknown}../profiles/damaged: there is no profile ../profiles/damaged"),
+    ):
+        assert NodeMatch.parse(f"type:{kind}").why_not(station, uuid) == why
+    found = [matching._is_profile(kind, station) for kind in ("gripper", "damaged", "no-such-type", "../gripper")]
+    assert found == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("detection", "verdict", "origin", "why"),
+    [
+        ("transparent", "unsigned", "session", ""),
+        ("whitelist", "unsigned", "session", "detection is not transparent"),
+        ("transparent", None, "session", "its datasheet was not read in a session"),
+        ("transparent", "unsigned", "plain", "its datasheet is unsigned"),
+        ("transparent", "authentic", "session", "its datasheet is authentic"),
+        ("transparent", "not authentic", "session", "its datasheet is not authentic"),
+    ],
+)
+def test_only_what_is_read_in_a_session_and_has_no_signature_is_measured_unverified(
+    detection: str, verdict: str | None, origin: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = None if verdict is None else SimpleNamespace(verified=SimpleNamespace(verdict=verdict), origin=origin)
+    monkeypatch.setattr(matching, "verdict_of", lambda _station, _uuid: judged)
+    image = Image(LEG, load_profile("gripper").build(LEG).blocks)
+    none = "it has no datasheet of its own"
+    for stored, missing in ((image, ""), (Image(LEG, {}), none), (None, none)):
+        station = station_of(
+            measurements=SimpleNamespace(detection=detection),
+            datasheets=SimpleNamespace(datasheet=lambda _, stored=stored: stored),
+        )
+        assert matching.UnsignedNodes().why_not(station, LEG) == (why or missing)
+
+
+def test_a_nodes_share_is_waited_for_until_every_expected_one_is_known() -> None:
+    share, waits = BusShare(BusTime(CanAirtime())), list[tuple[bool, float]]()
+    told = list[str]()
+    guard: Any = _Guard(lambda ready, seconds: waits.append((ready(), seconds)), lambda: told.append("told"))
+    share.lock = guard
+    share.expect([ARM, LEG])
+    share.announce_share(ARM, 0.1)
+    share.announce_share(LEG, 0.2)
+    assert waits == [(False, 1.0), (True, 1.0)]
+    told.clear()
+    share.drop_node(LEG)
+    assert told == ["told"], "those that wait for it wait no more"
+    share.announce_share(ARM, 0.1)
+    assert waits[-1] == (True, 1.0)
+
+
+class _Guard:
+    """A condition that records what is done with it."""
+
+    def __init__(self, wait_for: Any, notify_all: Any) -> None:
+        self.wait_for, self.notify_all = wait_for, notify_all
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *_: object) -> None: ...

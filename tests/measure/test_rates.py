@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from teds_provision.measure.rates import (
     lower_rate,
     propose,
     rounded_down,
+    this_machine,
 )
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.protocol.operation.budget import MOST_LOAD
@@ -94,6 +96,64 @@ def test_one_rate_for_all_is_no_faster_than_the_slowest_channel(station: tuple[S
     both = proposed(station, Surroundings(values=1_000), 1, 2)
     assert (both.limit, both.rate) == ("machine", 100), "else it would be refused"
     assert propose(station[0], [bytes(10)], MeasurementRequest(), Surroundings()) is None, "nothing is known of it"
+
+
+@pytest.mark.parametrize(
+    ("cores", "load", "free", "busy"),
+    [
+        (2, 0.0, 50_000.0, ""),
+        (2, 1.0, 50_000.0, ""),
+        (2, 3.0, 25_000.0, "this machine is busy (load 3 on 2 cores)"),
+        (8, 31.0, 12_500.0, "this machine is busy (load 31 on 8 cores)"),
+        (None, 1.0, 25_000.0, "this machine is busy (load 1 on 1 cores)"),
+        (2, None, 50_000.0, ""),
+    ],
+)
+def test_a_machine_has_room_for_50_000_values_a_second_as_far_as_its_processors_are_free(
+    cores: int | None, load: float | None, free: float, busy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def loads() -> tuple[float, float, float]:
+        if load is None:
+            raise OSError
+        return load, 99.0, 99.0
+
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(os, "getloadavg", loads)
+    assert this_machine() == (free, busy)
+
+
+def test_only_requested_sensors_that_have_a_rate_count(station: tuple[Station, bytes, bytes]) -> None:
+    """The gripper: an actuator (1) and two sensors of 100 Hz (2 and 3)."""
+    hand = [station[2]]
+
+    def machine(values: float, *channels: int) -> RateProposal | None:
+        return propose(station[0], hand, MeasurementRequest(channels=channels), Surroundings(values=values))
+
+    for channels, values in (((), 200.0), ((2,), 100.0), ((2, 3), 200.0), ((1, 2), 100.0)):
+        whole = machine(values, *channels)
+        assert whole == RateProposal(100.0, 100.0, "datasheet", ""), channels
+        less = machine(values - 0.5, *channels)
+        assert less is not None
+        assert (less.limit, less.rate, less.why) == (
+            "machine",
+            50.0,
+            f"this machine records about {values - 0.5:.0f} values/s",
+        )
+    assert machine(HIGH, 1) is None, "an actuator alone"
+    assert machine(HIGH, 9) is None
+
+
+def test_messages_to_topics_count_with_the_fastest_channel_of_each_node(
+    station: tuple[Station, bytes, bytes],
+) -> None:
+    """Two channels with 10 messages a second each, and two messages for each of 100 rows."""
+    for budget, rate in ((220.0, 100.0), (219.0, 50.0), (119.0, 20.0)):
+        found = proposed(station, Surroundings(values=HIGH, budget=budget, rows=True), 2)
+        assert found.rate == rate
+        assert (found.limit, found.why) == (
+            ("datasheet", "") if rate == 100 else ("budget", f"topics take {budget:g} messages/s")
+        )
+    assert proposed(station, Surroundings(values=HIGH, budget=20.0), 2).limit == "datasheet", "without rows"
 
 
 @pytest.mark.link
