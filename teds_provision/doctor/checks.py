@@ -8,7 +8,7 @@ simulate a machine with any hardware.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -47,8 +47,8 @@ class System:
     workspace: Path = field(default_factory=Path.cwd)
     root: Path = Path("/")
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
-    settings: Callable[[], Mapping[str, frozenset[str]]] | None = None
-    """Returns the valid names of config.toml, by table ("" outside of one); None if they are unknown."""
+    bad_names: Callable[[dict[str, Any], str], Iterable[str]] = lambda _values, _text: ()
+    """Returns what is wrong with the names of config.toml (its values and text), each with its line."""
     bad_value: Callable[[Mapping[str, Any]], str] = lambda _: ""
     """Returns which value of config.toml no command takes, and why; "" if all are good."""
     ask: Callable[[str, bool], str] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from teds_provision import teds
 from teds_provision.doctor.checks import Finding, System, check, intact
@@ -32,37 +32,22 @@ def config(system: System) -> Iterator[Finding]:
         yield Finding("config", "skipped", "There is no config.toml.")
         return
     try:
-        values = load_toml(read_text(path, LIMITS.text_file, "config.toml"), str(path))
+        text = read_text(path, LIMITS.text_file, "config.toml")
+        values = load_toml(text, str(path))
     except (BadDataError, NotFoundError) as error:
         yield Finding("config", "failed", error.message, error.hint or "Fix or remove the file.")
         return
-    unknown = list(_unknown(values, system))
-    if unknown:
-        names = ", ".join(unknown[:_SHOWN])
-        yield Finding("config", "failed", f"{path} has unknown settings: {names}.", f"Remove them from {path}.")
+    wrong = list(system.bad_names(values, text))
+    if wrong:
+        more = f" And {len(wrong) - _SHOWN} more." if len(wrong) > _SHOWN else ""
+        why = f"{path}, {' '.join(wrong[:_SHOWN])}{more}"
+        yield Finding("config", "failed", why, "Fix or remove that line." if len(wrong) == 1 else "Fix these lines.")
         return
     bad = system.bad_value(values)
     if bad:
         yield Finding("config", "failed", bad, "Fix that line.")
     else:
         yield Finding("config", "ok", f"{path} contains {counted(len(values), 'setting')}.")
-
-
-def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:
-    if system.settings is None:
-        return
-    settings = system.settings()
-    known = {table: {name.replace("-", "_") for name in names} for table, names in settings.items()}
-    for key, value in values.items():
-        name = key.replace("-", "_")
-        if not isinstance(value, dict):
-            if name not in known[""]:
-                yield key
-        elif key.replace("_", "-") not in settings:
-            yield f"[{key}]"
-        else:
-            allowed = known[key.replace("_", "-")]
-            yield from (f"{key}.{inner}" for inner in value if inner.replace("-", "_") not in allowed)
 
 
 @check("profiles", "machine")

@@ -12,11 +12,10 @@ from typing import Any
 
 import click
 
-from teds_provision.cli.config_file import config_path
+from teds_provision.cli.config_file import config_path, problems
 from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.station.config import check_values
-from teds_provision.cli.table import COMMANDS
 from teds_provision.doctor.checks import Finding, System, examine, exit_code
 from teds_provision.doctor.report import build_report
 from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
@@ -64,10 +63,9 @@ def doctor(
     if report is not None and str(report) != "-":
         require_new(report)
     root = click.get_current_context().find_root()
-    group = root.command
-    settings = partial(known_settings, group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    system = System(app.home, nfc, can, ble, full, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root))
+    bad_value = partial(_bad_value, app, root)
+    system = System(app.home, nfc, can, ble, full, bad_names=problems, bad_value=bad_value, ask=ask)
     found = list(examine(system))
     findings = [finding for _, finding in found]
     checks = [asdict(finding) for finding in findings]
@@ -141,30 +139,3 @@ def _print(console: Console, findings: list[Finding]) -> None:
         console.print(line)
         if finding.fix and finding.result != "ok":
             console.print(Padding(Text(f"→ {finding.fix}"), (0, 0, 0, 9)))
-
-
-# Which keys config.toml may have: the options of every command, by the names that the command line gives them.
-
-
-def known_settings(group: click.Group) -> dict[str, frozenset[str]]:
-    """Return valid names of config.toml: under "" outside of a table, under a command's name in its table.
-
-    A name is that of an option without its dashes, written with ``-`` or ``_``. Loads every command.
-    """
-    context = click.Context(group)
-    of = {name: _names(group.get_command(context, name)) for name in COMMANDS}
-    everywhere = frozenset[str]().union(_own(group), *of.values())
-    return {"": everywhere, **of}
-
-
-def _names(command: click.Command | None) -> frozenset[str]:
-    if command is None:
-        return frozenset()
-    inner = command.commands.values() if isinstance(command, click.Group) else ()
-    names = frozenset(part.name for part in inner if part.name)
-    return _own(command).union(names, *map(_names, inner))
-
-
-def _own(command: click.Command) -> frozenset[str]:
-    options = (option for option in command.params if isinstance(option, click.Option))
-    return frozenset(word.lstrip("-") for option in options for word in (*option.opts, *option.secondary_opts))
