@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import LinkError, NodeRefusedError
+from teds_provision.errors import BadDataError, LinkError, NodeRefusedError, PolicyError
 from teds_provision.measure import held_actuator
 from teds_provision.measure.held_actuator import HeldActuator
 from teds_provision.measure.verified_session import VerifiedSession, claim
@@ -170,3 +170,57 @@ def test_the_claim_of_an_actuator_shortens_no_lease_of_its_session() -> None:
     with HeldActuator(session, 1, dead_man=400):
         pass
     assert [(channel, payload[0]) for channel, payload in asked] == [(0, 40), (1, 40)]
+
+
+def chosen(channel: int | str, unit: str | None = None) -> HeldActuator:
+    node: Any = None
+    return HeldActuator(VerifiedSession(node, SHEET, "00" * 32, "g"), channel, unit=unit)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "why"),
+    [
+        (0.11, None, ""),
+        (0.0, None, ""),
+        (110, "mm", ""),
+        (11, "cm", ""),
+        (0.1101, None, "0.1101 m exceeds the limits of channel 1 (opening set point), 0 to 0.11 m."),
+        (-0.001, None, "-0.001 m exceeds the limits of channel 1 (opening set point), 0 to 0.11 m."),
+        (110.1, "mm", "110.1 mm exceeds the limits of channel 1 (opening set point), 0 to 110 mm."),
+        (float("nan"), "mm", "nan mm exceeds the limits of channel 1 (opening set point), 0 to 110 mm."),
+        (float("inf"), None, "inf m exceeds the limits of channel 1 (opening set point), 0 to 0.11 m."),
+    ],
+)
+def test_a_value_beyond_the_limits_is_refused_in_its_unit_and_never_adjusted(
+    value: float, unit: str | None, why: str
+) -> None:
+    actuator = chosen(1, unit)
+    if not why:
+        assert actuator.octets_of(value) == (4095 if value else 0).to_bytes(2, "big")
+        return
+    with pytest.raises(PolicyError) as refusal:
+        actuator.octets_of(value)
+    assert (refusal.value.message, refusal.value.exit_code) == (why, 6)
+
+
+def test_an_actuator_is_chosen_by_its_number_its_name_or_what_it_sets() -> None:
+    for channel in (1, "opening set point", "opening", "OPENING"):
+        assert chosen(channel).channel.number == 1
+    for channel in (2, 3):
+        with pytest.raises(BadDataError) as refusal:
+            chosen(channel)
+        label = SHEET.channels[channel - 1].label
+        assert refusal.value.message == f"Channel {label} of node {bytes(10).hex()} is a sensor, not an actuator."
+        assert refusal.value.hint == "Its actuators: 1 (opening set point)."
+    with pytest.raises(BadDataError):
+        chosen("closing")
+
+
+def test_a_unit_of_another_kind_is_refused_with_those_that_can_be_used() -> None:
+    with pytest.raises(BadDataError) as refusal:
+        chosen(1, "N")
+    assert refusal.value.message == ("N is not a unit for channel 1 (opening set point), whose values are in m.")
+    assert refusal.value.hint.startswith("Use ")
+    assert " or m." in refusal.value.hint or refusal.value.hint == "Use m."
+    assert chosen(1).unit.text == "m"
+    assert chosen(1, "um").unit.to_si(5) == pytest.approx(5e-6)

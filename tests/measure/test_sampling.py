@@ -279,3 +279,30 @@ def test_the_text_of_a_raw_number_is_that_of_a_valid_one_and_only_a_full_turn_ha
     radians = parse_unit("rad").units
     assert sampled(0, good=True, units=radians, low=-math.pi, high=math.pi).turn == -math.pi
     assert sampled(0, good=True, units=radians, low=-math.pi, high=0.0).turn is None
+
+
+def test_channels_of_one_reply_are_cut_apart_and_each_says_why_it_has_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Channel 1 is calibrated, 2 is not, 3 needs a channel that the datasheet lacks; all come in one reply."""
+    inputs = (CalibrationInput(3, 1, (0, 65535), (0,)), CalibrationInput(60, 1, (0, 65535), (0,)))
+    lacking = Calibration(3, "polynomial", inputs, (0.0, 0.0, 0.001, 0.0), unit=parse_unit("N"))
+    line = replace(fit([(0, 0.0), (10_000, 10.0)], "linear", channel=1), unit=parse_unit("N"))
+    sheet = sheet_of("tactile-finger-sensor", {1: line, 3: lacking})
+    course = list[str]()
+
+    def request(command: Command, doing: str) -> bytes:
+        course.append(f"{doing} {command.payload.hex()}".strip())
+        if doing != "to sample":
+            return b""
+        return SampleReply(10**9, 0, b"".join((100 * number).to_bytes(2, "big") for number in command.payload)).encode()
+
+    monkeypatch.setattr(sampling, "exchange_clock", lambda _node, _clock: None)
+    monkeypatch.setattr(sampling, "claim", lambda *_, lease: None)
+    trusted = VerifiedSession(cast(Any, SimpleNamespace(request=request)), sheet, "00" * 32, "finger")
+    found = sampling.take_samples(trusted, [3, 1, 2])
+    assert course == ["to sample 030102", "to let go"]
+    assert [(one.channel, one.raw, one.valid) for one in found] == [(3, 300, False), (1, 100, True), (2, 200, False)]
+    assert found[1].value == pytest.approx(0.1)
+    assert [one.value for one in found[::2]] == [None, None]
+    assert found[0].why == "Channel 3 is compensated by channel 60, which is not described."
+    assert found[2].why.startswith("Channel 2 has no calibration")
+    assert found[1].why == ""

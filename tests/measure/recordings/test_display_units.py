@@ -141,3 +141,12 @@ def test_facts_come_back_as_they_were_and_channels_in_si_stay() -> None:
     first = items()[0]
     assert conversion.convert(first) is first
     assert conversion.convert(replace(first, uuid=HAND)) is not None, "a channel that nothing describes stays as it is"
+
+
+def test_limits_that_are_not_stated_stay_so_and_a_factor_alone_means_nothing() -> None:
+    bare = replace(TURNED, low=None, high=None, uncertainty=None, deviation=None)
+    shown = in_display_units(bare)
+    assert (shown.low, shown.high, shown.uncertainty, shown.deviation, shown.unit) == (None, None, None, None, "°")
+    assert in_si_units(shown) == bare
+    odd = replace(TURNED, si_unit="", si_factor=2.0)
+    assert in_si_units(odd) == odd
