@@ -291,8 +291,8 @@ def test_the_live_line_has_the_step_that_runs_and_what_it_waits_for(monkeypatch:
     assert line().endswith(" s left)")
     live.notice(Notice("retry", "Again."))
     assert (line(), above) == ("identify  Again.", [])
-    live.notice(Notice("node-came", "A node came."))
-    assert (line(), above) == ("identify  Again.", ["… A node came."])
+    live.notice(Notice("reader-ready", "The bus is back."))
+    assert (line(), above) == ("identify  Again.", ["… The bus is back."])
     live.started("agree")
     assert line() == "agree", "what the step before waited for is over"
     live.written(3, 7)

@@ -233,11 +233,11 @@ def test_an_unpinned_entry_gains_a_key_and_keeps_the_rest(station: Station) -> N
     assert after is not None
     assert (after.fingerprint, after.name, after.assurance, after.added) == (KEY, "finger", "import", before.added)
     assert plan_addition(station, [ListedNode(1, ONE), ListedNode(2, ONE, KEY)]).write == ()
-    station.pins.put(replace(before, assurance="wired"))
+    station.pins.put(replace(before, assurance="bus"))
     put(station, ListedNode(1, ONE, KEY))
     after = station.pins.entry(ONE)
     assert after is not None
-    assert (after.fingerprint, after.assurance) == (KEY, "wired"), "a list takes no assurance away"
+    assert (after.fingerprint, after.assurance) == (KEY, "bus"), "a list takes no assurance away"
 
 
 def test_the_first_name_that_a_file_gives_a_node_is_its_name(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_a_verdict_has_the_same_members_as_object_json_and_description() -> None
 def test_one_file_of_many_has_the_members_of_one_alone() -> None:
     alone = list(VERDICT.verified.to_json())
     for verified in (VERDICT.verified, None):
-        assert list(FileVerdict(PACKAGE, verified).to_json()) == ["file", *alone, "warnings"]
+        assert list(FileVerdict(str(PACKAGE), verified).to_json()) == ["file", *alone, "warnings"]
 
 
 WORDS = [

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
@@ -157,7 +157,7 @@ class Scene:
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
-    def later(self, seconds: float) -> Scene:
+    def later(self, seconds: float) -> Self:
         """Let time pass."""
         self.now += seconds
         return self

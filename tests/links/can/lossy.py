@@ -128,4 +128,4 @@ if __name__ == "__main__":
 
     install()
     sys.argv[0] = "teds-provision"
-    sys.exit(main())
+    main()
