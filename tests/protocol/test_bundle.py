@@ -6,6 +6,7 @@ import json
 import tracemalloc
 from dataclasses import replace
 from datetime import timedelta
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -389,3 +390,46 @@ def test_a_node_written_by_hand_is_the_json_that_an_encoder_gives(
     coordinates = {"x": encode_base64url(point[:32]), "y": encode_base64url(point[32:])}
     assert members["node_public_key"] == {"kty": "EC", "crv": "P-256", **coordinates}
     assert members["key"] == {"kty": "oct", "k": encode_base64url(key), "kid": node.kid}
+
+
+LAST = 0xFFFFFFFF
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"expires": NOW - timedelta(hours=1)}, "expires before it was made"),  # the very moment
+        ({"expires": NOW - timedelta(minutes=59)}, None),
+        ({"nodes": (node(epoch=LAST, sequence=LAST),)}, None),
+        ({"nodes": (node(epoch=1, sequence=0),)}, None),
+        ({"nodes": (node(epoch=0),)}, "out of its range"),
+        ({"nodes": (node(epoch=LAST + 1),)}, "out of its range"),
+        ({"nodes": (node(sequence=LAST + 1),)}, "out of its range"),
+        ({"nodes": (node(sequence=-1),)}, "out of its range"),
+        ({"nodes": (node(name="x" * 1024),)}, None),
+        ({"nodes": (node(name="x" * 1025),)}, "out of its range"),
+        ({"nodes": (node(groups=("a", "two\nlines")),)}, "out of its range"),
+        ({"nodes": (node(profile="\x1b"),)}, "out of its range"),
+        ({"nodes": (node(), node())}, "names an UUID twice"),
+    ],
+)
+def test_what_a_sender_seals_at_its_edges(changes: dict[str, Any], why: str | None) -> None:
+    made = bundle(**changes)
+    if why is None:
+        opened = open_bundle(seal_bundle(made, SENDER, [RECEIVER.point]), RECEIVER, trusts(SENDER), None)
+        assert opened.bundle.nodes == made.nodes
+        return
+    with pytest.raises(BadDataError, match=why):
+        seal_bundle(made, SENDER, [RECEIVER.point])
+
+
+@pytest.mark.parametrize(
+    ("named", "sealed_to"),
+    [((RECEIVER,), (RECEIVER, THIRD)), ((RECEIVER, THIRD), (RECEIVER,)), ((RECEIVER,), (THIRD,)),
+     ((RECEIVER,), (RECEIVER, RECEIVER))],
+)  # fmt: skip
+def test_a_bundle_is_sealed_to_those_that_it_names_and_no_others(
+    named: tuple[SoftwareKey, ...], sealed_to: tuple[SoftwareKey, ...]
+) -> None:
+    with pytest.raises(BadDataError, match="other recipients"):
+        seal_bundle(bundle(to=named), SENDER, [station.point for station in sealed_to])
