@@ -27,6 +27,7 @@ def no_other_run(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--json nodes", "--json nodes"),
         ("nodes --home h 8d4d -q", "--home h -q nodes 8d4d"),
         ("nodes --home=h -vv", "--home=h -vv nodes"),
+        ("nodes --home=h 8d4d", "--home=h nodes 8d4d"),
         ("nodes --passphrase-fd=3 --no-input --debug", "--passphrase-fd=3 --no-input --debug nodes"),
         ("--home nodes nodes --json", "--home nodes --json nodes"),
         ("--passphrase-fd 3 verify --json 8d4d --verbose", "--passphrase-fd 3 --json --verbose verify 8d4d"),

@@ -147,3 +147,77 @@ def test_the_certificate_of_a_run_is_one_that_was_read_now() -> None:
 def test_an_order_that_was_prepared_for_no_type_is_composed_by_the_one_of_the_node(station: Station) -> None:
     station.nodes.remember(UUID, profile="load-cell")
     assert compose(station, UUID, PreparedOrder(BuildOrder()), None).profile.name == "load-cell"
+
+
+NAMED, CALIBRATED = BuildOrder(name="a"), BuildOrder(drop_calibration=True)
+
+
+@pytest.mark.parametrize(
+    ("ordered", "intact", "fixed", "mends", "way"),
+    [
+        # nothing is named: what a node has stays
+        (BuildOrder(), True, False, False, "as it is"),
+        (BuildOrder(), True, True, False, "as it is"),
+        # a type: all of it, and no calibration of a run that was cut
+        (BuildOrder(FINGER), True, False, False, "composed, named, anew"),
+        (BuildOrder(FINGER, name="a"), True, True, False, "composed, named, anew"),
+        # anything else: that alone
+        (NAMED, True, False, False, "what is named"),
+        (CALIBRATED, True, False, False, "what is named"),
+        # what is not authentic is mended, else composed; of a type that was not named that needs a yes
+        (BuildOrder(), False, False, True, "mended"),
+        (BuildOrder(), False, False, False, "composed, resumed"),
+        (NAMED, False, False, False, "composed, resumed"),
+        (BuildOrder(FINGER), False, False, False, "composed, named, resumed"),
+        # fixed TEDS of the factory are no datasheet that is lost
+        (BuildOrder(), False, True, True, "composed, named, resumed"),
+        (NAMED, False, True, True, "composed, named, resumed"),
+        (BuildOrder(FINGER), False, True, False, "composed, named, resumed"),
+        (BuildOrder(adopt=True), False, True, False, "composed, named, resumed"),
+        # its own datasheet
+        (BuildOrder(adopt=True), False, False, False, "as it is"),
+        (BuildOrder(adopt=True), True, True, False, "as it is"),
+        (BuildOrder(adopt=True, name="a"), False, False, False, "brought"),
+        (BuildOrder(adopt=True, name="a"), True, True, False, "brought"),
+    ],
+)
+def test_what_a_node_gets_by_what_it_has_and_what_is_named(
+    monkeypatch: pytest.MonkeyPatch, ordered: BuildOrder, intact: bool, fixed: bool, mends: bool, way: str
+) -> None:
+    def composed_of(*_: object, named: bool, resume: bool = True) -> str:
+        return f"composed, {'named, ' if named else ''}{'resumed' if resume else 'anew'}"
+
+    brought = SimpleNamespace(image=Image(UUID, {(0, 12): b"x"}), name="a")
+    monkeypatch.setattr(step, "_intact", lambda *_: intact)
+    monkeypatch.setattr(step, "_composed", composed_of)
+    monkeypatch.setattr(step, "_as_it_is", lambda *_: "as it is")
+    monkeypatch.setattr(step, "_mended", lambda *_: "mended" if mends else None)
+    monkeypatch.setattr(step, "_only_what_is_named", lambda *_: "what is named")
+    monkeypatch.setattr(step, "read_factory_datasheet", lambda *_, **__: brought)
+    present: Any = SimpleNamespace(is_fixed=fixed, image=Image(UUID, {}))
+    found = step._proposal(None, PreparedOrder(ordered), present)  # type: ignore[arg-type]
+    if way == "brought":
+        assert (found.image, found.named, found.name) == (brought.image, True, "a")
+    else:
+        assert found == way
+
+
+@pytest.mark.parametrize(("has", "keeps"), [("nothing", True), ("a key alone", True), ("a datasheet", False)])
+def test_a_trial_build_changes_no_facts_of_a_node_that_has_a_datasheet(
+    station: Station, monkeypatch: pytest.MonkeyPatch, has: str, keeps: bool
+) -> None:
+    blocks = dict(composed(station, BuildOrder(FINGER)).blocks)
+    known = {"nothing": None, "a key alone": Image(UUID, {SECURITY: b"x"}), "a datasheet": Image(UUID, blocks)}[has]
+    monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: known)
+    monkeypatch.setattr(step, "known_node_keys", lambda *_: None)
+    monkeypatch.setattr(step, "unsigned_security", lambda *_: b"unsigned")
+    step.build(station, UUID, BuildOrder(FINGER, name="trial"), keep_draft=False)
+    assert station.nodes.get(UUID) is None
+    assert station.datasheets.draft(UUID) is None
+    step.build(station, UUID, BuildOrder(FINGER, name="trial"))
+    record = station.nodes.get(UUID)
+    kept = (record.profile, record.name) if record is not None else (None, None)
+    assert kept == ((FINGER, "trial") if keeps else (None, None))
+    draft = station.datasheets.draft(UUID)
+    assert draft is not None
+    assert (draft.stage, draft.profile, draft.image.security) == ("built", FINGER, b"unsigned")
