@@ -453,6 +453,21 @@ def test_a_measurement_goes_on_after_any_failure_of_a_run_and_of_its_sinks(monke
     assert ran == ["sink 0", "sink 1", "sink 3", "sink 4", "sink 5"], "new ones for each run"
 
 
+def test_nodes_and_group_are_held_while_it_measures() -> None:
+    held: list[tuple[object, object, object]] = []
+
+    def running(uuids: object, *, group: object = None, what: object = None) -> Any:
+        held.append((uuids, group, what))
+        raise PolicyError("Another measurement holds it.")
+
+    measurements = SimpleNamespace(nodes_of=lambda _kept: (UUID,), holder=lambda _uuid: None, running=running)
+    station: Any = SimpleNamespace(measurements=measurements)
+    for kept in (KeptMeasurement("7", group="hand"), KeptMeasurement("8", uuids=(UUID,))):
+        with pytest.raises(PolicyError, match="holds it"):
+            MeasurementJob(station, kept).run(cast(Any, None), threading.Event())
+    assert held == [((UUID,), "hand", "measure hand"), ((UUID,), None, f"measure {UUID.hex()[:8]}")]
+
+
 def test_a_measurement_whose_time_is_over_is_kept_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     forgotten = list[str]()
     station: Any = SimpleNamespace(measurements=SimpleNamespace(forget=forgotten.append))

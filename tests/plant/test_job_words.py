@@ -339,6 +339,67 @@ def test_a_job_takes_no_datasheet_of_another_base(home: Path) -> None:
         )
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--profile", "load-cell"),
+        ("--calibration", "cell.csv"),
+        ("--no-calibration",),
+        ("--name", "cell"),
+        ("--accept-calibration", "it is so"),
+        ("--retype",),
+    ],
+    ids=" ".join,
+)
+def test_what_a_job_determines_cannot_be_named_beside_it(home: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+    a_job(home)
+    (tmp_path / "cell.csv").write_text("raw,value [N]\n0,0\n65535,100\n")
+    given = [word.replace("cell.csv", str(tmp_path / "cell.csv")) for word in words]
+    refused = call(home, "--json", "provision", "--job", "abcd", *given, "--nfc", "udp:localhost:9")
+    assert refused.code == 2
+    error = refused.json["error"]
+    assert error["message"] == "The job already defines what each board gets."
+    assert words[0] in error["hint"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--calibrations", "."),
+        ("--operator", "Eve"),
+        ("--files", "."),
+        ("--only", "verify"),
+        ("--label-to", "."),
+        ("--scan",),
+    ],
+    ids=" ".join,
+)
+def test_what_belongs_to_a_line_needs_a_job_or_evidence(home: Path, words: tuple[str, ...]) -> None:
+    refused = call(home, "--json", "provision", *words, "--nfc", "udp:localhost:9")
+    assert refused.code == 2
+    assert refused.json["error"]["hint"] == "Add --job FILE, or --evidence."
+    assert words[0] in refused.json["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--evidence", "--only", "verify"), "--only verify requires --job."),
+        (("--evidence", "--batch", "s.csv"), "--batch cannot be combined with --job or --evidence."),
+        (("--job", "abcd", "--batch", "s.csv"), "--batch cannot be combined with --job or --evidence."),
+    ],
+    ids=["only verify", "batch and evidence", "batch and job"],
+)
+def test_options_of_a_line_that_do_not_go_together(
+    home: Path, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    a_job(home)
+    (tmp_path / "s.csv").write_text("uuid,name\n8d4d9da65281f7000001,a\n")
+    given = [word.replace("s.csv", str(tmp_path / "s.csv")) for word in words]
+    refused = call(home, "--json", "provision", *given, "--nfc", "udp:localhost:9")
+    assert (refused.code, refused.json["error"]["message"]) == (2, message)
+
+
 def test_a_dry_run_of_an_export_of_evidence_makes_no_folder(home: Path, tmp_path: Path) -> None:
     folder = tmp_path / "proofs"
     with opened(home) as station:

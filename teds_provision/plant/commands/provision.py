@@ -99,7 +99,7 @@ class LineOptions:
         if self.job is not None and not (order.names_nothing and order.accept_calibration is None and not order.retype):
             raise UsageError(
                 "The job already defines what each board gets.",
-                hint="Drop --profile, --calibration, --name and --retype.",
+                hint="Drop --profile, --calibration, --no-calibration, --name, --accept-calibration and --retype.",
             )
 
 

@@ -108,6 +108,24 @@ def test_an_adapter_is_full_by_its_word_or_if_it_holds_connections_and_takes_no_
     assert ble_errors.is_full(Exception(text), range(held)) is full
 
 
+def test_a_bluetoothd_that_does_not_answer_and_one_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    raised: list[Exception] = [TimeoutError(), OSError("It is broken")]
+
+    async def adapters(_bus: str | None) -> list[bluez.AdapterFacts]:
+        raise raised.pop(0)
+
+    monkeypatch.setattr(bluez, "_adapters", adapters)
+    with pytest.raises(NoReaderError) as silent:
+        bluez.adapters("tcp:host=127.0.0.1,port=9")
+    assert (silent.value.message, silent.value.hint) == (
+        "bluetoothd does not answer.", "sudo systemctl restart bluetooth",
+    )  # fmt: skip
+    with pytest.raises(NoReaderError) as broken:
+        bluez.adapters("tcp:host=127.0.0.1,port=9")
+    assert broken.value.message == "Cannot talk to bluetoothd: It is broken."
+    assert "bluetooth" in broken.value.hint
+
+
 def test_the_words_of_a_full_adapter_and_of_a_silent_node() -> None:
     assert ble_errors.too_many(1, "hci0").message == "The Bluetooth of hci0 holds 1 connection and takes no more."
     assert ble_errors.too_many(2, "hci0").message == "The Bluetooth of hci0 holds 2 connections and takes no more."

@@ -502,6 +502,25 @@ def test_topics_of_a_damaged_chunk_come_from_the_summary_then_from_the_chunk(tmp
     assert found == [("std_msgs/msg/Float64", b"float64 data", name)]
 
 
+@pytest.mark.parametrize("behind", [True, False], ids=["a good record behind it", "nothing good behind it"])
+def test_damage_before_a_good_record_is_no_torn_end(tmp_path: Path, behind: bool) -> None:
+    """In a file without an end, what is damaged behind the last good record is where the writer was cut."""
+    message = mcap_record(0x05, struct.pack("<HIQQ", 1, 0, 5, 5) + bytes(8))
+    packed = bytearray(compress_frame(message))
+    packed[-1] ^= 0xFF
+    octets = MAGIC + mcap_record(0x01, text("ros2") + text(""))
+    at = len(octets)
+    head = struct.pack("<QQQI", 5, 5, len(message), zlib.crc32(message)) + text("zstd")
+    octets += mcap_record(0x06, head + struct.pack("<Q", len(packed)) + packed)
+    damaged = len(octets) - at
+    if behind:
+        octets += mcap_record(0x0C, text("station") + struct.pack("<I", 0))  # metadata
+    path = tmp_path / "run.mcap"
+    path.write_bytes(octets + b"\x05\xff")
+    done = recover(path)
+    assert [(each.offset, each.octets) for each in done.damaged] == ([(at, damaged)] if behind else [])
+
+
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_whatever_is_behind_a_recording_that_was_cut_its_whole_records_stay(
