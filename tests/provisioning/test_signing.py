@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision import teds
-from teds_provision.errors import BadDataError, FrozenError, NotFoundError, PolicyError
+from teds_provision.errors import BadDataError, FrozenError, NotFoundError, PolicyError, TedsProvisionError, UsageError
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.datasheet import SignedNodeKey
+from teds_provision.provisioning import sign as signing
+from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.sign import (
     SignOrder,
     known_node_keys,
@@ -241,3 +246,81 @@ def test_nothing_is_signed_of_a_node_without_a_datasheet(station: Station, image
     other = make_station(tmp_path / "other")
     with pytest.raises(PolicyError):
         sign_image(other, SignOrder(image.uuid, image), None)
+
+
+def test_an_image_file_needs_a_place_for_what_is_signed_and_a_plan_does_not(
+    station: Station, image: Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "image.json"
+    file.write_text(image.to_json())
+    orders: list[SignOrder] = []
+    monkeypatch.setattr(signing, "sign_image", lambda _station, order, node: orders.append(order))
+
+    def at(what: str, **how: object) -> None:
+        signing.sign_at(station, LinkSettings(), what, SilentReporter(), **how)  # type: ignore[arg-type]
+
+    with pytest.raises(UsageError, match=r"^Signing an image file requires an output file\.$"):
+        at(str(file))
+    at(str(file), output=tmp_path / "out.json")
+    at(str(file), dry_run=True)
+    at(image.uuid.hex())
+    assert [(order.image is not None, order.dry_run) for order in orders] == [
+        (True, False), (True, True), (False, False),
+    ]  # fmt: skip
+
+
+def test_a_node_that_is_not_whitelisted_costs_no_passphrase(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[object] = []
+    monkeypatch.setattr(type(station), "unlock", lambda *_: opened.append(1))
+    station.pins.remove(image.uuid)
+    with pytest.raises(PolicyError, match="is not on the whitelist"):
+        signing.sign_at(station, LinkSettings(), image.uuid.hex(), SilentReporter())
+    assert opened == []
+
+
+@pytest.mark.parametrize(
+    ("read", "same", "usable"), [(False, True, True), (False, False, True), (True, True, True), (True, False, False)]
+)
+def test_the_signature_of_a_node_that_was_altered_is_not_used_again(
+    image: Image, read: bool, same: bool, usable: bool
+) -> None:
+    """It takes what it was signed for only under a newer sequence."""
+    found: Any = SimpleNamespace() if read else None
+    present = signing._PresentTeds(image if same else renamed(image), 1, 1, found)
+    assert present.security_for(image) == (security_of(image) if usable else None)
+    assert signing._PresentTeds(None, 1, 1, found).security_for(image) is None
+
+
+@pytest.mark.parametrize(
+    ("known", "brought", "refused"),
+    [(0, 70_000, False), (5, 65_541, False), (5, 65_542, True), (70_000, 5, False)],
+)
+def test_a_file_uses_up_at_most_one_step_of_the_numbers_of_a_known_node(
+    station: Station, monkeypatch: pytest.MonkeyPatch, known: int, brought: int, refused: bool
+) -> None:
+    uuid = bytes(9) + b"\x07"
+    if known:
+        station.nodes.remember(uuid, sequence=known)
+    shown = SimpleNamespace(key_epoch=3, signed=True, station_key=b"another", sequence=brought)
+    monkeypatch.setattr(signing.security, "decode", lambda _octets: shown)
+    file = Image(uuid, {SECURITY: b"x"})
+    if refused:
+        with pytest.raises(PolicyError, match=rf"^The image has sequence {brought}; the last one known here is"):
+            signing._last_known(station, uuid, None, file)
+        return
+    present = signing._last_known(station, uuid, None, file)
+    assert (present.epoch, present.sequence) == (3, brought)
+    shown.station_key = station.point
+    assert signing._last_known(station, uuid, None, file).sequence == 0, "the number was given here"
+
+
+@pytest.mark.parametrize(("seconds", "good"), [(0, True), (2**32 - 1, True), (2**32, False), (-1, False)])
+def test_a_clock_that_no_signature_can_hold_is_wrong(monkeypatch: pytest.MonkeyPatch, seconds: int, good: bool) -> None:
+    monkeypatch.setattr(signing, "time", SimpleNamespace(time_ns=lambda: seconds * 10**9 + 7))
+    if good:
+        assert signing._now() == seconds.to_bytes(4, "big") + bytes([0, 0, 0, 7])
+        return
+    with pytest.raises(TedsProvisionError, match=r"^This machine's clock is wrong\.$"):
+        signing._now()
