@@ -57,6 +57,7 @@ class Stage:
     def reset(self) -> None:
         """A station that is live and has nothing."""
         self.pass_time(100)  # what was announced, and nobody waited for
+        self.page.clock.set_system_time(NOW + 60)
         self.page.evaluate(RESET)
         self.wrong.clear()
 

@@ -112,7 +112,7 @@ def test_what_was_reviewed_is_written_and_another_write_is_reviewed_again(writin
 
 def test_nothing_to_change_offers_no_write_and_cancel_clears(writing: Stage) -> None:
     give(writing, "slew.json", "{}")
-    writing.page.get_by_role("button", name="Cancel").click()
+    press(writing, "Cancel")
     assert text(writing, ".plan") == ""
     writing.answers(**{DRY: {"changes": []}})
     give(writing, "slew.json", "{}")
@@ -221,7 +221,7 @@ def test_all_listed_nodes_are_selected_or_none_and_others_stay(many: Stage) -> N
     able = {name: many.page.get_by_role("button", name=name).is_enabled()
             for name in ("Verify", "Measure", "Update firmware", "Add to group")}  # fmt: skip
     assert able == {"Verify": True, "Measure": False, "Update firmware": False, "Add to group": False}
-    many.page.get_by_role("button", name="Select").click()
+    press(many, "Select")
     assert (chosen(many), many.run("return window.bulk.on")) == ([], False)
 
 
@@ -344,6 +344,7 @@ def test_the_plan_says_of_each_board_what_happens_and_only_answered_questions_co
 def test_without_an_image_a_board_or_a_right_there_is_no_plan(firmware: Stage) -> None:
     ask = firmware.page.get_by_role("button", name="Show the plan")
     assert ask.is_enabled()
+    assert firmware.page.get_by_role("button", name="Select boards").is_hidden()
     for changed in ({"status": {"write": False, "links": []}}, {"connection": "lost", "status": {"links": []}}):
         change(firmware, **changed)
         assert ask.is_disabled()
@@ -366,6 +367,9 @@ def test_without_an_image_a_board_or_a_right_there_is_no_plan(firmware: Stage) -
     firmware.page.get_by_text("finger.bin, 1 KiB").wait_for()
     press(firmware, "Show the plan")
     assert texts(firmware, ".plan [role=alert]") == ["No image. Sign it."]
+    give(firmware, "other.bin", "z")
+    firmware.page.get_by_text("other.bin, 1 KiB").wait_for()
+    assert text(firmware, ".plan") == "", "that was about another image"
 
 
 def test_how_an_update_goes_is_told_board_by_board(firmware: Stage) -> None:
@@ -398,6 +402,9 @@ def test_how_an_update_goes_is_told_board_by_board(firmware: Stage) -> None:
         boards[2]["step"] = step
         firmware.run("state.updates = [words[0]]; window.panel.paint()", told)
         assert texts(firmware, "[aria-label='Boards of this update'] li")[2].endswith(shown)
+    boards[3]["state"] = "running"
+    firmware.run("state.updates = [words[0]]; window.panel.paint()", told)
+    assert firmware.page.get_by_role("button", name="Begin no further board").is_hidden(), "all have begun"
     boards[2] |= {"step": NONE, "result": "reverted", "seconds": 1}
     boards[3] |= {"state": "skipped"}
     over = told | {"state": "stopped", "owner": "page", "ended": NOW + 5}

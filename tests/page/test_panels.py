@@ -243,7 +243,7 @@ def test_a_measurement_without_a_group_is_named_by_whom_it_measures(measuring: S
         assert measuring.page.get_by_role("button", name="Measure all trusted nodes").is_visible() is (
             measurement.get("match") != "all"
         )
-    measuring.page.get_by_role("button", name="Stop", exact=True).click()
+    press(measuring, "Stop")
     press(measuring, "Measure all trusted nodes")
     assert sent(measuring) == [
         {"method": "DELETE", "path": "measurements/m", "body": {}},

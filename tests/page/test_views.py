@@ -30,8 +30,18 @@ def gripper(**more: Any) -> dict[str, Any]:
     return {"uuid": ARM, "name": "hand", "whitelisted": True, "present": True, "channels": [opening, sensor]} | more
 
 
+PRESS = """
+  const named = (one) => (one.getAttribute("aria-label") ?? one.innerText).trim() === words[0];
+  const found = [...document.querySelectorAll("button")].filter((one) => named(one) && one.checkVisibility());
+  if (found.length !== 1 || found[0].disabled) throw new Error(`${found.length} buttons to press: ${words[0]}`);
+  found[0].focus();
+  found[0].click();
+"""
+
+
 def press(stage: Stage, name: str) -> None:
-    stage.page.get_by_role("button", name=name, exact=True).click()
+    """Press the one button of this name that is seen, at a twentieth of what a mouse costs."""
+    stage.run(PRESS, name)
 
 
 def change(stage: Stage, **more: Any) -> None:

@@ -24,7 +24,7 @@ export class ProvisionTab {
     this.calibration = h("input", { type: "file", accept: ".csv,.toml,.json,.txt,.xml", onchange: () => this.paint() });
     this.item = h("input", { type: "text", maxlength: "120", autocomplete: "off", placeholder: "only if several fit" });
     this.choice = field("Result of the certificate", this.item);
-    this.go = button("Provision", { class: "main", onclick: () => this.go.busy(() => this.start()) }, "good");
+    this.go = button("Provision", { class: "main", onclick: () => this.go.busy(() => this.start()).then(() => this.paint()) }, "good");
     this.cancel = button("Cancel", { onclick: () => this.cancel.busy(() => this.end_waiting()) });
     this.waiting = h("div", { class: "waiting", role: "status" });
     this.clock = h("span", { class: "figure", "aria-hidden": "true" });
