@@ -66,7 +66,7 @@ def test_a_number_has_the_digits_that_its_uncertainty_allows(stage: Stage) -> No
 
 def test_who_holds_a_node_and_whether_a_newer_datasheet_was_written(stage: Stage) -> None:
     """`older_than` was in the answer, and nowhere on the page."""
-    nobody = {"holders": {}, "epoch": NONE, "written_by": NONE, "older_than": NONE, "firmware": NONE}
+    nobody: dict[str, Any] = {"holders": {}, "epoch": NONE, "written_by": NONE, "older_than": NONE, "firmware": NONE}
     held = {"holders": {"a1": ["north"], "b2": ["south"]}, "epoch": 3, "sequence": 7, "written_by": "west"}
     runs = {"text": "nrf/loadcell", "version": "1.3.0", "build": NONE, "by": "south"}
     stage.table(
