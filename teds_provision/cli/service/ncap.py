@@ -300,9 +300,7 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         there = "there" if node["present"] else _away(node["last_seen"])
         name = shown(node["name"]) or "no name"
         problem = f": {node['problem']['message']}" if node["problem"] else ""
-        running = node["measuring"] is not None and node["measuring"]["state"] == "running"
-        stale = _OF_LAST_SESSION if locked and node["verdict"] is not None and not running else ""
-        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}{stale}{problem}", markup=False)
+        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node, locked=bool(locked))}{problem}", markup=False)
     for known in found.get("measurements", ()):
         what = f" of {known['match']}" if known.get("match") else ""
         why = f": {known['why']}" if known["why"] else ""
@@ -325,18 +323,19 @@ def _away(last_seen: str | None) -> str:
     return f"away, last seen {local_time(last_seen)}" if last_seen else "away"
 
 
-def _verdict(node: dict[str, Any]) -> str:
+def _verdict(node: dict[str, Any], *, locked: bool) -> str:
     if node["verdict"] is None:
         return "not verified yet"
-    if node.get("unverified"):
-        return "unverified (its datasheet is not signed)"
-    verdict = node["verdict"]["verdict"]
     running = node["measuring"] is not None and node["measuring"]["state"] == "running"
-    if node["present"] and not running and (node["problem"] or node.get("heard")):
+    stale = _OF_LAST_SESSION if locked and not running else ""
+    if node.get("unverified"):
+        return f"unverified (its datasheet is not signed){stale}"
+    verdict = node["verdict"]["verdict"]
+    if node["present"] and not running and not stale and (node["problem"] or node.get("heard")):
         # what answers there now opened no session, so it may be another board under this UUID
         return f"not verified now ({verdict} when last read)"
     kept = " (stored copy, except the Security TEDS)" if node["verdict"]["from"] == "kept" else ""
-    return f"{verdict}{kept}"
+    return f"{verdict}{kept}{stale}"
 
 
 def _link(link: dict[str, Any]) -> str:
