@@ -112,6 +112,7 @@ def test_what_was_reviewed_is_written_and_another_write_is_reviewed_again(writin
 
 def test_nothing_to_change_offers_no_write_and_cancel_clears(writing: Stage) -> None:
     give(writing, "slew.json", "{}")
+    writing.page.get_by_role("button", name="Cancel").wait_for()
     press(writing, "Cancel")
     assert text(writing, ".plan") == ""
     writing.answers(**{DRY: {"changes": []}})
@@ -145,7 +146,7 @@ def test_a_suspicious_calibration_needs_a_reason_and_another_type_a_button(writi
 
 
 def test_a_file_that_is_too_large_is_refused_and_one_may_be_dropped(writing: Stage) -> None:
-    give(writing, "big.xml", "x" * 900_001)
+    writing.run("window.panel.take(new File([new Uint8Array(900_001)], 'big.xml'))")
     writing.page.get_by_role("alert").filter(has_text="big.xml is too large for a datasheet (900001 bytes)").wait_for()
     assert writing.sent == []
     writing.run(
@@ -359,7 +360,7 @@ def test_without_an_image_a_board_or_a_right_there_is_no_plan(firmware: Stage) -
     assert text(firmware, ".stack > p").endswith("node 77777777 and 2 more")
     firmware.run("window.chosen = words; window.panel.paint()", *ten[:9])
     assert text(firmware, ".stack > p").endswith("node 77777777 and 1 more")
-    give(firmware, "large.bin", "x" * (4 * 1024 * 1024 + 1))
+    firmware.run("window.panel.take(new File([new Uint8Array(4 * 1024 * 1024 + 1)], 'large.bin'))")
     firmware.page.get_by_role("alert").filter(has_text="large.bin is too large").wait_for()
     assert (ask.is_disabled(), text(firmware, ".drop strong")) == (True, "Choose a firmware image")
     firmware.answers(**{"POST updates": {"refused": 422, "message": "No image.", "hint": "Sign it."}})

@@ -366,10 +366,10 @@ def test_the_legend_has_value_rate_and_what_was_lost_and_the_foot_what_came(movi
     change(moving, connection="lost")
     assert moving.page.locator(".charts.stale").count() == 1
     moving.sent  # noqa: B018
-    moving.pass_time(6100)
+    moving.run("window.plot.ask()")
     assert moving.sent == [], "a lost station is not asked"
     change(moving, connection="live")
-    moving.pass_time(3100)
+    moving.run("window.plot.ask()")
     assert {entry["path"].split("&")[0] for entry in moving.sent} == {
         f"nodes/{ARM}/past?channel={number}" for number in (1, 2)
     }
