@@ -100,7 +100,7 @@ def calibrated(inside: str, profile: Profile, item: str | None = None) -> Calibr
         (r"\metre\per\second\metre", "m²/s", 1.0),  # a \per is for one factor
         (r"\centi\metre\tothe{2}", "m²", 1e-4),  # a power is that of the prefix too
         (r"\kilogram\per\deci\metre\tothe{3}", "kg/m³", 1000.0),
-        (r"\micro\siemens\per\centi\metre", "A/(V*m)", 1e-4),
+        (r"\micro\siemens\per\centi\metre", "A/V/m", 1e-4),
         (r"\kelvin\tothe{0.5}", "K**0.5", 1.0),
     ],
 )  # fmt: skip

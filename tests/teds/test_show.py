@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
+from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats import TedsBlock, read_blocks
 from teds_provision.teds.show import describe, hexadecimal, instant, seconds, shown_to_json, signed_block, span
@@ -134,8 +135,6 @@ def test_damage_never_raises(path, data):
 
 @given(st.integers(1, 255), st.binary(max_size=120), st.sampled_from([2007, 2024]))
 def test_any_content_of_any_class_never_raises(code, content, edition):
-    from teds_provision.teds.codec.frame import frame
-
     head = bytes([3, 4, 0, code, 1, 1]) if edition == 2007 else bytes([3, 5, 0, 255, code, 2, 1])
     octets = frame(head + content)
     json.dumps(shown_to_json(describe(TedsBlock(None, code, octets), {(0, code): octets}, now=NOW)), allow_nan=False)
@@ -280,3 +279,67 @@ def test_a_block_that_a_signature_covers_is_the_same_absent_or_another():
     assert signed_block(raw, {(0, 12): name + b"x"}) == f"{head} (OTHER DIGEST)"
     assert signed_block(raw, {(0, 1): b"", (1, 12): name}) == f"{head} (absent)"
     assert signed_block(raw, {(0, 1): b""}) == head, "of one TEDS alone nothing is missing"
+
+
+def test_words_for_codes_keys_and_what_is_not_known():
+    fields = [("CalKey", 127), ("ChanType", 0), ("PhyUnits", KELVIN), ("DataXmit", 128), ("EdgeRpt", 4)]
+    octets = teds.compose(3, fields)
+    named = {name: (text, meaning) for _, name, text, meaning in rows_of(shown_of(3, fields))}
+    assert named["CalKey"] == ("127", "reserved")
+    assert named["DataXmit"] == ("128", "manufacturer's own")
+    assert named["EdgeRpt"] == ("4", "reserved")
+    strange = describe(TedsBlock(None, 3, frame(unframe(octets) + bytes([200, 2, 0xAB, 0xCD]))), now=NOW)
+    assert rows_of(strange)[-1] == (200, "type 200", "abcd", "")
+    assert strange.summary == (), "without limits there is no range"
+
+
+def test_a_range_without_a_unit_is_not_guessed():
+    shown = shown_of(3, [("CalKey", 0), ("ChanType", 0), ("LowLimit", 0.0), ("HiLimit", 5.0), ("OError", 0.5)])
+    assert shown.summary == ()
+    assert texts(shown)["HiLimit"] == "5"
+
+
+def test_a_foreign_security_teds_in_words():
+    key = bytes.fromhex("04" + "11" * 64)
+    shown = shown_of(
+        128,
+        [("UsedSecScheme", 1), ("UsedVerAlg", 2), ("UsedEncAlg", 3), ("UsedHashAlg", 0), ("Signature", b"\x01" * 64),
+         ("NodePublicKey", key), ("BaseStationPublicKey", b"\x22" * 20)],
+    )  # fmt: skip
+    assert rows_of(shown)[1:] == [
+        (1, "UsedSecScheme", "1", "AsVerification"),
+        (2, "UsedVerAlg", "2", "ECDSA"),
+        (3, "UsedEncAlg", "3", "DES"),
+        (4, "UsedHashAlg", "0", "MD5"),
+        (100, "Signature", "signature, 64 octets as raw: 0101010101010101…", ""),
+        (101, "NodePublicKey", "P-256 key, fingerprint f0b9315a0459dab7 (raw)", ""),
+        (103, "BaseStationPublicKey", "no P-256 key, 20 octets as raw: 2222222222222222…", ""),
+    ]
+    assert [field.weak for field in shown.fields][1:] == [False, False, True, True, False, False, False]
+    assert [part.get("weak") for part in shown_to_json(shown)["fields"]] == [None, None, True, True, None, None, None]
+    assert shown.summary[0] == ("kind", "another vendor's Security TEDS (no field 105): shown, never trusted")
+    assert ("signature", "claims to be signed; check with: verify") in shown.summary
+
+
+def test_a_finding_as_json_has_what_is_known_of_it():
+    octets = teds.compose(3, {"PhyUnits": KELVIN, "LowLimit": 5.0, "HiLimit": 1.0})
+    found = {entry["code"]: entry for entry in shown_to_json(describe(TedsBlock(None, 3, octets), now=NOW))["findings"]}
+    assert found["limits"].keys() >= {"severity", "offset", "code", "message"}
+    assert found["limits"]["severity"] == "error"
+    assert "" not in found["limits"].values()
+    assert None not in found["limits"].values()
+    missing = found["missing"]
+    assert missing["field"]
+
+
+def test_a_calibration_without_its_place_is_shown_as_that_of_channel_1():
+    channel = teds.compose(3, {"PhyUnits": PASCAL, "LowLimit": 0.0, "HiLimit": 2e6})
+    calibration = teds.compose(
+        5,
+        [("LowLimit", 0.0), ("HiLimit", 16.0),
+         ("CalInput", {"ChanNum": 1, "ChanKey": 0, "Degree": 1, "Boundaries": (0.0, 100.0), "Offsets": (0.0,)}),
+         ("Coefs", (0.0, 0.16))],
+    )  # fmt: skip
+    beside = {(1, 3): channel}
+    for place, text in ((None, "16 Pa"), (1, "16 Pa"), (2, "16")):
+        assert texts(describe(TedsBlock(place, 5, calibration), beside, now=NOW))["HiLimit"] == text
