@@ -21,7 +21,7 @@ from teds_provision.protocol.operation.commands import (
     write_data_set,
 )
 from teds_provision.protocol.operation.hardware import ChannelHardware, SessionPort
-from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, drive, stop
+from teds_provision.protocol.operation.stream_commands import CLOCK, Action, StreamKind, drive, stop
 from teds_provision.teds.sheet import ChannelKind
 from tests.firmware.bench import CBench, MeasuringMemoryNode
 from tests.protocol.operation import (
@@ -34,7 +34,7 @@ from tests.protocol.operation import (
     test_triggers,
 )
 from tests.protocol.operation.bench import MS, SECOND, channel_teds
-from tests.protocol.operation.consumer import Consumer
+from tests.protocol.operation.consumer import Consumer, clock
 from tests.protocol.operation.kat import MESSAGE_KEY
 from tests.protocol.operation.test_claims import CHALLENGE, IDENTIFY, VALUE, safe
 from tests.protocol.operation.test_driving import Wheel
@@ -319,3 +319,23 @@ def test_drive_and_streams_go_in_the_form_in_which_they_were_asked_for(fd: bool)
     sizes = [len(frame.data) for _, frame in bench.frames]
     assert {frame.fd for _, frame in bench.frames} == {fd}
     assert sizes == ([64, 12] if fd else [8] * 9 + [1]), "13 + 10 · 6 octets; FD knows no 9"
+
+
+def test_drive_frames_for_another_node_disturb_none_of_ones_own() -> None:
+    wheel = Wheel(CBench().open().operate(4, 6, dead_man=500))
+    own = node(wheel.bench)  # type: ignore[arg-type]
+    pieces = list(cut(wheel.message(1000, 1001), fd=False, drive=True))
+    for piece in pieces:
+        own.take_frame(0x18EFC1F1, pieces[0].data)
+        own.drive("can:f1", piece.data)
+    assert len(pieces) > 1
+    assert wheel.points == (1000, 1001)
+
+
+def test_a_trigger_has_eight_octets() -> None:
+    bench = CBench()
+    bench.open()
+    token = test_triggers.armed(bench, Action.MARK).octets
+    for data, mark in ((token + bytes(4), 0), (token[:7], 0), (token, bench.hardware.tick)):
+        node(bench).take_frame(0x18FF00F1, data, fd=len(data) > 8)
+        assert (clock(bench).mark != 0) == bool(mark)
