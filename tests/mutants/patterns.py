@@ -5,6 +5,41 @@ from __future__ import annotations
 from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
+    Pattern(
+        "a taken key gets a slot that its node never had",
+        "ImportedRows._key",
+        "self.slots.get(node.uuid, 0) + 1",
+        "self.slots.get(node.uuid, 0)",
+        "tests/handover/test_taken_rows.py",
+    ),
+    Pattern(
+        "a pin that a bundle made whole is an import",
+        "ImportedRows._rows",
+        "not is_whole(pin.fingerprint)",
+        "pin.fingerprint is None",
+        "tests/handover/test_taken_rows.py",
+    ),
+    Pattern(
+        "what is known of a node goes before a bundle's word",
+        "ImportedRows._node",
+        "known.profile or node.profile",
+        "node.profile or known.profile",
+        "tests/handover/test_taken_rows.py",
+    ),
+    Pattern(
+        "all other receivers of a copy hold its keys",
+        "ImportedRows.__init__",
+        "sorted({bundle.sender, *bundle.to} - {station.fingerprint})",
+        "[bundle.sender]",
+        "tests/handover/test_taken_rows.py",
+    ),
+    Pattern(
+        "the ban of another key keeps no node out",
+        "_Judge._obstacle",
+        "why and (key is None or same_key(key, fingerprint(node.node_key)))",
+        "why",
+        "tests/handover/test_taken_rows.py",
+    ),
     # a batch of boards, and what every command shares
     Pattern(
         "a whitelisted board that is not provisioned is not finished",
