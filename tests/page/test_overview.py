@@ -424,7 +424,20 @@ def tap(stage: Stage, uuid: str) -> Any:
     return stage.run("return location.hash")
 
 
-def test_a_tap_opens_its_node_unless_something_else_is_being_done(whole: Stage) -> None:
+def test_the_page_as_a_whole(whole: Stage) -> None:
+    """Three in one, as each would start the page again."""
+    open_what_is_tapped(whole)
+    whole.run("document.getElementById('toasts').replaceChildren()")
+    show_the_view_of_an_address(whole)
+    whole.run("document.getElementById('toasts').replaceChildren(); location.hash = '#/nodes'")
+    whole.pass_time(400)
+    whole.run("window.sockets.at(-1).tell({ type: 'beat' })")  # it was silent meanwhile
+    whole.pass_time(20)
+    show_the_connection(whole)
+
+
+def open_what_is_tapped(whole: Stage) -> None:
+    """A tap opens its node unless something else is being done."""
     assert tap(whole, HAND) == f"#/nodes/{HAND}"
     assert whole.said == "Tapped: slew."
     assert tap(whole, ARM) == f"#/nodes/{HAND}", "another node is open"
@@ -448,7 +461,8 @@ def test_a_tap_opens_its_node_unless_something_else_is_being_done(whole: Stage) 
     )
 
 
-def test_the_header_says_how_the_connection_is_and_what_it_may_do(whole: Stage) -> None:
+def show_the_connection(whole: Stage) -> None:
+    """The header says how the connection is, and has what this browser may do."""
     assert (text(whole, "h1"), text(whole, "#connection")) == ("Base station bench", "Live")
     assert whole.run("return document.title") == "Nodes – base station"
     assert whole.page.get_by_role("button", name="Whitelist", pressed=True).count() == 1
@@ -497,7 +511,8 @@ def test_the_header_says_how_the_connection_is_and_what_it_may_do(whole: Stage) 
     assert whole.sent == [], "it asks no more"
 
 
-def test_an_address_that_names_no_view_is_the_list_of_nodes_and_an_error_is_told(whole: Stage) -> None:
+def show_the_view_of_an_address(whole: Stage) -> None:
+    """An address that names no view is the list of nodes; an error is told."""
     for address, title, name in (
         ("#/log", "Log", "log"),
         ("#/toString", "Nodes", "nodes"),
