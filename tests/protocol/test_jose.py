@@ -402,3 +402,26 @@ def test_any_json_where_a_key_belongs(value):
     for read in (point_of, link_key_of):
         with pytest.raises(BadDataError):
             read(value, "it")
+
+
+def test_a_signature_has_64_octets_and_one_spelling() -> None:
+    """A zero before s is the same number, and another document."""
+    key = SoftwareKey(81)
+    document = jose.sign_compact(b"{}", key, typ="x+jws")
+    header, payload, signature = document.split(b".")
+    octets = decode_base64url(signature, "The signature")
+    for longer in (octets[:32] + b"\0" + octets[32:], b"\0" + octets, octets + b"\0"):
+        changed = b".".join([header, payload, base64url(longer)])
+        with pytest.raises(NotAuthenticError, match="does not verify"):
+            jose.verify_compact(changed, lambda kid: key.point, typ="x+jws", max_octets=4096)
+    assert jose.verify_compact(document, lambda kid: key.point, typ="x+jws", max_octets=4096).payload == b"{}"
+
+
+def test_a_kid_is_the_fingerprint_of_the_key_that_verifies() -> None:
+    """A store that gives another key under a name gives nobody that name."""
+    key, named = SoftwareKey(81), SoftwareKey(82)
+    header = base64url(dump({"alg": "ES256", "kid": fingerprint(named.point), "typ": "x+jws"}))
+    message = header + b"." + base64url(b"{}")
+    document = message + b"." + base64url(key.sign(message))
+    with pytest.raises(NotAuthenticError, match="is not trusted here"):
+        jose.verify_compact(document, lambda kid: key.point, typ="x+jws", max_octets=4096)
