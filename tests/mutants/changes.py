@@ -20,6 +20,7 @@ from tests.parsed import parsed
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "teds_provision"
 SOURCES_IN_C = ROOT / "firmware" / "src"
+SCRIPTS = PACKAGE / "ncap" / "page" / "js"
 
 _COMPARISONS: dict[type[ast.cmpop], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
@@ -77,6 +78,21 @@ class CPattern:
     was: str
     now: str
     test: str
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return SOURCES_IN_C / self.file
+
+
+@dataclass(frozen=True)
+class ScriptPattern(CPattern):
+    """The same of the page and a script of it, in ``ncap/page/js``."""
+
+    @property
+    def path(self) -> Path:
+        """The script."""
+        return SCRIPTS / self.file
 
 
 class Module:
@@ -175,8 +191,8 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
 
 
 def found_in_c(pattern: CPattern) -> list[Mutant]:
-    """Return the places of a pattern in the C library; one, where all is well."""
-    path = SOURCES_IN_C / pattern.file
+    """Return the places of a pattern in the C library or in a script of the page; one, where all is well."""
+    path = pattern.path
     source, name = path.read_text(), path.relative_to(ROOT).as_posix()
     description = f"{pattern.rule}: {' '.join(pattern.was.split())[:90]}  ->  {pattern.now}"
     return [

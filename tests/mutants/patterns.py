@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.mutants.changes import CPattern, Pattern
+from tests.mutants.changes import CPattern, Pattern, ScriptPattern
 
 PATTERNS = (
     Pattern(
@@ -3987,5 +3987,148 @@ C_PATTERNS = (
         "teds_sooner(&next, teds_sessions_poll(node, now));",
         "(void)teds_sessions_poll(node, now);",
         _C_TESTS,
+    ),
+)
+
+SCRIPT_PATTERNS = (
+    ScriptPattern(
+        "an actuator whose button is let go is not renewed",
+        "views/actuator.js",
+        "    this.holding = false;\n    delete",
+        "    delete",
+        "tests/page/test_views.py",
+    ),
+    ScriptPattern(
+        "a lost connection lets go of an actuator",
+        "views/actuator.js",
+        "    if (!may && this.holding) this.letGo();\n",
+        "",
+        "tests/page/test_views.py",
+    ),
+    ScriptPattern(
+        "another window in front lets go of an actuator",
+        "views/actuator.js",
+        '    window.addEventListener("blur", this.gone);\n',
+        "",
+        "tests/page/test_views.py",
+    ),
+    ScriptPattern(
+        "a pointer that slips off the button still holds it",
+        "views/actuator.js",
+        "      this.button.setPointerCapture(event.pointerId);\n",
+        "",
+        "tests/page/test_views.py",
+    ),
+    ScriptPattern(
+        "the page says safe only when the node has confirmed it",
+        "views/actuator.js",
+        "done.safe === true",
+        "done",
+        "tests/page/test_views.py",
+    ),
+    ScriptPattern(
+        "set points of the page follow one another",
+        "views/actuator.js",
+        "    if (this.sending) return;\n",
+        "",
+        "tests/page/test_views.py",
+    ),
+    ScriptPattern(
+        "a slider stays within the limits",
+        "format.js",
+        "rounded < (low ?? -Infinity) ? low : rounded > (high ?? Infinity) ? high : rounded",
+        "rounded",
+        "tests/page/test_modules.py",
+    ),
+    ScriptPattern(
+        "what is written is what was reviewed",
+        "views/write.js",
+        ", { match: reviewed.tag }",
+        "",
+        "tests/page/test_forms.py",
+    ),
+    ScriptPattern(
+        "a write after another one is reviewed again",
+        "views/write.js",
+        "error.status !== 412",
+        "true",
+        "tests/page/test_forms.py",
+    ),
+    ScriptPattern(
+        "an odd calibration is written with a reason only",
+        "views/write.js",
+        "reason.value.trim() && this",
+        "this",
+        "tests/page/test_forms.py",
+    ),
+    ScriptPattern(
+        "a board with a question is updated only after an answer",
+        "views/update.js",
+        "(!one.question || this.yes.get(one.uuid).checked)",
+        "true",
+        "tests/page/test_forms.py",
+    ),
+    ScriptPattern(
+        "an older answer replaces no later list of measurements",
+        "state.js",
+        "  if (request < newest) return;\n",
+        "",
+        "tests/page/test_state.py",
+    ),
+    ScriptPattern(
+        "an older list brings back no node",
+        "state.js",
+        "      else found.delete(uuid);\n",
+        "",
+        "tests/page/test_state.py",
+    ),
+    ScriptPattern(
+        "points of another quantity are not drawn on",
+        "state.js",
+        "before.scale.si !== channel.scale.si || ",
+        "",
+        "tests/page/test_state.py",
+    ),
+    ScriptPattern(
+        "a value that is not valid is a gap",
+        "state.js",
+        "values[index] ?? NaN",
+        "values[index] ?? 0",
+        "tests/page/test_state.py",
+    ),
+    ScriptPattern(
+        "a silent station is noticed within two seconds",
+        "live.js",
+        "const SILENCE = 1500;",
+        "const SILENCE = 2500;",
+        "tests/page/test_state.py",
+    ),
+    ScriptPattern(
+        "names from nodes are marked where they hide letters",
+        "dom.js",
+        "document.createTextNode(seen(child))",
+        "document.createTextNode(child)",
+        "tests/page/test_modules.py",
+    ),
+    ScriptPattern(
+        "a list that loses an entry keeps the focus",
+        "dom.js",
+        "focused?.isConnected",
+        "false",
+        "tests/page/test_modules.py",
+    ),
+    ScriptPattern(
+        "one refused node stops no other",
+        "views/bulk.js",
+        "          refused.push([uuid, error.message]);\n",
+        "          throw error;\n",
+        "tests/page/test_forms.py",
+    ),
+    ScriptPattern(
+        "a virtual transducer is deleted only when it is said twice",
+        "views/virtual.js",
+        "    if (!sure) {",
+        "    if (false) {",
+        "tests/page/test_parts.py",
     ),
 )

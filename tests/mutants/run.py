@@ -39,7 +39,7 @@ from queue import SimpleQueue
 
 from tests.mutants.changes import ROOT, Mutant, any_of, found, found_in_c, modules
 from tests.mutants.nearest import Suite
-from tests.mutants.patterns import C_PATTERNS, PATTERNS
+from tests.mutants.patterns import C_PATTERNS, PATTERNS, SCRIPT_PATTERNS
 
 PLACE = ROOT / "build" / "mutants"
 FILES = 14
@@ -253,7 +253,7 @@ def main(arguments: list[str]) -> int:
         if len(found(pattern, everywhere)) != 1
     ] + [
         f"{pattern.file}: {pattern.was} is not there once ({pattern.rule})"
-        for pattern in C_PATTERNS
+        for pattern in (*C_PATTERNS, *SCRIPT_PATTERNS)
         if len(found_in_c(pattern)) != 1
     ]
     if lost:
@@ -262,6 +262,8 @@ def main(arguments: list[str]) -> int:
     named = [mutant for pattern in PATTERNS for mutant in found(pattern, where)]
     if chosen.room in ("", IN_C):
         named += [mutant for pattern in C_PATTERNS for mutant in found_in_c(pattern)]
+    if chosen.room in ("", "ncap", "ncap/page"):
+        named += [mutant for pattern in SCRIPT_PATTERNS for mutant in found_in_c(pattern)]
     others = (
         []
         if chosen.patterns or chosen.room == IN_C

@@ -11,7 +11,7 @@ import pytest
 
 from tests.mutants.changes import ROOT, Module, Mutant, Pattern, any_of, found, found_in_c, modules
 from tests.mutants.nearest import Suite
-from tests.mutants.patterns import C_PATTERNS, PATTERNS
+from tests.mutants.patterns import C_PATTERNS, PATTERNS, SCRIPT_PATTERNS
 from tests.mutants.run import MOST, Bench, Copy, Fate, Ran, drawn, report
 
 
@@ -39,11 +39,11 @@ def test_every_rule_is_found_once_and_its_change_is_python(house: list[Module]) 
         assert without != with_it, pattern.rule
 
 
-def test_every_rule_of_the_node_in_c_is_found_once() -> None:
-    for pattern in C_PATTERNS:
+def test_every_rule_of_the_node_in_c_and_of_the_page_is_found_once() -> None:
+    for pattern in (*C_PATTERNS, *SCRIPT_PATTERNS):
         (mutant,) = found_in_c(pattern)
         source = (ROOT / mutant.path).read_text()
-        assert source.splitlines()[mutant.line - 1] in source[mutant.start - 200 : mutant.end + 200]
+        assert source.splitlines()[mutant.line - 1] in source[max(0, mutant.start - 400) : mutant.end + 400]
         assert mutant.applied(source) == source.replace(pattern.was, pattern.now)
         assert (ROOT / pattern.test).is_file()
 
