@@ -145,8 +145,8 @@ class Merge:
                 self.kept["revoked nodes off the whitelist"] += known is None
             elif entry.fingerprint is not None and pin not in (None, entry.fingerprint):
                 self.kept["whitelist entries pinned to another key now"] += 1
-            elif known is None and entry.uuid in self.removals and entry.added <= self.removals[entry.uuid]:
-                self.kept["nodes taken off the whitelist since"] += 1
+            elif known is None and entry.uuid in self.retired and entry.added <= self.retired[entry.uuid]:
+                self.kept["nodes taken out of service since"] += 1
             elif known is None or (self.newer and known != entry):
                 self.live.pins.restore([entry])
                 self.back["whitelist"] += 1
@@ -236,14 +236,14 @@ class Merge:
         }
 
     @cached_property
-    def removals(self) -> dict[bytes, str]:
-        """When a node was last taken off the whitelist or out of service, by the log of this store."""
-        removed = dict[bytes, str]()
-        for act, outcomes in (("whitelist", ("removed",)), ("decommission", _OUT_OF_SERVICE)):
-            for entry in self.live.audit_log.chosen(AuditFilter(act=act)):
-                if entry.uuid is not None and entry.outcome.startswith(outcomes):
-                    removed[entry.uuid] = max(entry.at, removed.get(entry.uuid, ""))
-        return removed
+    def retired(self) -> dict[bytes, str]:
+        """When a node was last taken out of service, by the log of this store."""
+        entries = self.live.audit_log.chosen(AuditFilter(act="decommission"))
+        return {
+            entry.uuid: entry.at
+            for entry in entries
+            if entry.uuid is not None and entry.outcome.startswith(_OUT_OF_SERVICE)
+        }
 
     def _decisions(self) -> None:
         """Merge the CAs whose trust a person ended, and the bans that a person lifted.

@@ -283,12 +283,12 @@ def test_what_a_person_ended_here_stays_ended(two: Two, how: Relation) -> None:
     two.copy.policy.deny(ban)
     two.copy.pins.restore([WhitelistEntry(A, KEY, AT)])
     two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY)
-    two.live.audit("whitelist", A, "removed")
+    two.live.audit("decommission", A, "replaced by another")
     two.live.policy.restore_lifted(hash_of_statement(ban.statement), b"m" * 16)
     done = two.merged(how)
     assert dict(done.back) == {}
     assert dict(done.kept) == {
-        "keys no longer trusted since": 1, "bans lifted since": 1, "nodes taken off the whitelist since": 1,
+        "keys no longer trusted since": 1, "bans lifted since": 1, "nodes taken out of service since": 1,
     }  # fmt: skip
 
 
