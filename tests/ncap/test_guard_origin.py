@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from teds_provision.ncap.web.guard import Guard, Message, Receive, Scope, Send, front
-from teds_provision.ncap.web.tokens import Tokens
+from teds_provision.errors import NotFoundError, StoreError, UsageError
+from teds_provision.ncap.web.guard import (
+    Caller,
+    Guard,
+    Message,
+    Receive,
+    RequestRefusedError,
+    Scope,
+    Send,
+    _bearer,
+    _limited,
+    _require_may_change,
+    front,
+)
+from teds_provision.ncap.web.tokens import Tokens, digest_of
 
 PORT = 8451
 HERE = f"127.0.0.1:{PORT}"
@@ -256,3 +271,118 @@ def test_a_bearer_token_goes_before_the_cookie(tmp_path: Path) -> None:
     ]
     assert [(caller.actor, caller.owner) for caller in callers] == [("token plotter", "api:plotter"), ("page", "page")]
     assert status_of(guard, {"host": HERE, "cookie": browser, "authorization": "Bearer nonsense"}) == 401
+
+
+IMAGE = "application/octet-stream"
+MEBI = 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "kind", "length", "status"),
+    [
+        ("POST", "/api/v1/updates", IMAGE, 4 * MEBI, None),
+        ("POST", "/api/v1/updates", IMAGE, 4 * MEBI + 1, 413),
+        ("POST", "/api/v1/updates", "application/json", 5, 415),
+        ("POST", "/api/v1/updates/u1", IMAGE, 5, 415),
+        ("PUT", "/api/v1/updates", IMAGE, 5, 415),
+        ("GET", "/api/v1/updates", "", MEBI + 1, 413),
+        ("PUT", "/api/v1/detection", "Application/JSON; charset=utf-8", MEBI, None),
+        ("PUT", "/api/v1/detection", "application/json", MEBI + 1, 413),
+        ("PUT", "/api/v1/detection", "", 0, 415),
+    ],
+)
+def test_a_change_is_json_of_a_mebibyte_or_the_image_of_an_update_of_four(
+    method: str, path: str, kind: str, length: int, status: int | None
+) -> None:
+    headers = {"content-type": kind, "content-length": str(length)}
+    with pytest.raises(RequestRefusedError) if status is not None else nullcontext() as refused:
+        _require_may_change({"type": "http", "method": method, "path": path}, headers, Caller("arm", "script"))
+    assert status is None or (refused is not None and refused.value.status == status)
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH"])
+def test_a_token_that_may_only_read_changes_nothing_and_hears_what_to_do(method: str) -> None:
+    caller, headers = Caller("plotter", "script", read_only=True), {"content-type": "application/json"}
+    with pytest.raises(RequestRefusedError) as refused:
+        _require_may_change({"type": "http", "method": method, "path": "/x"}, headers, caller)
+    assert (refused.value.status, refused.value.code) == (403, "read-only")
+    assert refused.value.hint == "Use a token that was added without --read-only."
+    _require_may_change({"type": "http", "method": "GET", "path": "/x"}, {}, caller)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "passes"), [((4, 4), True), ((8,), True), ((4, 4, 1), False), ((9,), False), ((0, 0), True)]
+)
+def test_a_body_that_comes_in_pieces_is_counted_whole(pieces: tuple[int, ...], passes: bool) -> None:
+    waiting = [{"body": bytes(octets)} for octets in pieces]
+
+    async def receive() -> Message:
+        return waiting.pop(0)
+
+    async def run() -> None:
+        following = _limited(receive, 8)
+        for _ in pieces:
+            await following()
+
+    with nullcontext() if passes else pytest.raises(RequestRefusedError):
+        asyncio.run(run())
+
+
+def test_of_eleven_wrong_tokens_the_last_is_slowed_down_and_told_when_to_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("teds_provision.ncap.web.guard._SLOWED", 0.0)
+    guard = Guard(app, Tokens(tmp_path), front((), PORT, tls=False))
+
+    async def run() -> list[RequestRefusedError]:
+        return [await guard._wrong_token() for _ in range(11)]
+
+    refused = asyncio.run(run())
+    assert [refusal.status for refusal in refused] == [401] * 10 + [429]
+    assert refused[-1].headers == ((b"retry-after", b"60"),)
+    assert "ncap open" in refused[0].hint
+
+
+def test_the_scheme_of_a_token_is_read_in_any_case() -> None:
+    given = ("Bearer abc", "bearer  abc ", "BEARER abc", "Basic abc", "abc", "")
+    assert [_bearer({"authorization": text}) for text in given] == ["abc"] * 3 + [""] * 3
+
+
+def test_a_name_is_one_token_of_a_script_and_whoever_removes_it_removes_all_of_that_name(tmp_path: Path) -> None:
+    tokens = Tokens(tmp_path)
+    link = tokens.login_link()
+    cookie = tokens.login(link)
+    assert cookie is not None
+    assert tokens.login(link) is None, "it works once"
+    script = tokens.add("browser")
+    with pytest.raises(UsageError, match="already exists"):
+        tokens.add("browser")
+    tokens.add("x" * 64)
+    for name in ("x" * 65, "a\nb", " ", ""):
+        with pytest.raises(UsageError, match="is not a valid token name"):
+            tokens.add(name)
+    with pytest.raises(NotFoundError) as unknown:
+        tokens.remove("plotter")
+    assert unknown.value.hint == f"Known tokens: browser, {'x' * 64}."
+    assert tokens.remove("browser") == 2
+    assert (tokens.find(script), tokens.find(cookie)) == (None, None)
+    tokens.remove("x" * 64)
+    with pytest.raises(NotFoundError) as unknown:
+        tokens.remove("plotter")
+    assert unknown.value.hint == "Known tokens: none."
+
+
+def test_tokens_of_another_process_are_read_as_soon_as_their_file_is_another_or_gone(tmp_path: Path) -> None:
+    tokens, file = Tokens(tmp_path), tmp_path / "ncap-tokens.json"
+    first = tokens.add("a")
+    assert tokens.is_good(digest_of(first))
+    before = file.stat()
+    second = Tokens(tmp_path).add("b")
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert all(tokens.is_good(digest_of(token)) for token in (first, second)), "another file of the same moment"
+    file.unlink()
+    assert not tokens.is_good(digest_of(first))
+    file.write_text("{}")
+    with pytest.raises(StoreError) as unreadable:
+        tokens.find(first)
+    assert unreadable.value.hint == "Remove the file and create new tokens: ncap token add NAME"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision.cli.config_file import brokers_of
 from teds_provision.client import ApiError
 from teds_provision.errors import BadDataError, StoreError, TedsProvisionError, UsageError
-from teds_provision.ncap.sinks import DaemonSinks, for_readers
+from teds_provision.ncap.sinks import DaemonSinks, for_readers, sink_json
 from teds_provision.station.store.records import KeptMeasurement
 from tests.e2e.desk import Desk
 from tests.ncap.service import Service, virtual
@@ -175,3 +176,35 @@ def test_set_points_come_by_a_topic_of_ros_if_daemon_and_measurement_let_them(
     sinks = DaemonSinks(tmp_path, daemon, actuators=actuators)
     assert sinks.allows_set_points(KeptMeasurement("m", sinks=named, actuators=kept)) is allowed
     assert (sinks.take_set_points, sinks.publish) == (takes, publishes)
+
+
+def test_a_sink_is_shown_with_all_of_its_counters() -> None:
+    stats = SimpleNamespace(
+        state="failed", detail="5 messages/s", error="The disk is full.", hint="Free some space.", written=7, dropped=2,
+        octets=99, messages=3,
+    )  # fmt: skip
+    sink: Any = SimpleNamespace(name="run.csv", stats=stats, recorder=True, files=(Path("/r/run.csv"),))
+    assert sink_json("m1", sink) == {
+        "measurement": "m1", "name": "run.csv", "state": "failed", "detail": "5 messages/s",
+        "error": "The disk is full.", "hint": "Free some space.", "written": 7, "dropped": 2, "octets": 99,
+        "messages": 3, "recorder": True, "files": ["/r/run.csv"],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("units", "scalars", "opened"),
+    [
+        ("si", True, ["/r/run.csv", "/r/run.mcap", "ros2"]),
+        ("shown", True, ["shown:/r/run.csv", "/r/run.mcap", "ros2"]),
+        ("si", False, ["/r/run.csv", "arrays:/r/run.mcap", "ros2"]),
+    ],
+)
+def test_files_of_the_service_have_its_units_and_its_topics(
+    units: Any, scalars: bool, opened: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    specs: list[str] = []
+    monkeypatch.setattr("teds_provision.ncap.sinks.open_sink", lambda spec, _take=None: specs.append(spec))
+    made = DaemonSinks(tmp_path, actuators=True, units=units, scalars=scalars)
+    for spec in ("/r/run.csv", "/r/run.mcap", "ros2"):
+        made.open(spec)
+    assert specs == opened
