@@ -491,6 +491,7 @@ def test_the_station_searches_when_the_typing_pauses_and_late_answers_are_droppe
     assert paths[0] == "log?limit=200&text=second&failed=1"
     assert paths[1].startswith("log?limit=200&text=second&failed=1&since=")
     assert minute <= int(paths[1].rpartition("=")[2]) <= minute + 120
+    assert int(paths[1].rpartition("=")[2]) % 60 == 0, "by the minute: the same search for as long"
     answer_log(log)
     search.fill("x")
     log.pass_time(260)
@@ -537,6 +538,9 @@ def test_a_nodes_history_has_its_own_entries_fifty_at_a_time(stage: Stage) -> No
     stage.pass_time(200)
     assert len(stage.sent) == 1
     assert texts(stage, ".history li")[0].startswith("10:00:00 act 51")
+    stage.run("hub.changed('log')")
+    stage.pass_time(1100)
+    assert len(stage.sent) == 1, "the next burst"
     for answer, words in (
         ({"refused": 404}, "No history for this node yet."),
         ({"refused": 503, "message": "Busy."}, "Busy."),

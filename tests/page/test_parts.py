@@ -114,6 +114,7 @@ def test_a_nodes_head_has_its_verdict_its_checks_and_what_was_heard_beside_it(he
     nodes(head, judged(checks=[]) | {"fingerprint": "abcd1234", "problem": {"message": "Odd.", "hint": "Look."}})
     head.pass_time(20)
     assert texts(head, "summary") == ["Key"]
+    assert head.page.locator(".node-head details").is_visible()
     assert texts(head, ".node-facts > .warn:not(.chip)") == ["Odd. Look."]
     assert texts(head, chips)[0] == "Not verified", "it is there, and has not proven itself"
     nodes(head, judged(checks=[]))
