@@ -88,6 +88,8 @@ _SILENCE_SECONDS: Final = 1.5
 """Seconds without a new node after which all were seen. Nodes advertise every 0.1 to 1 s."""
 _LONGEST_SECONDS: Final = 8.0
 _GONE_SECONDS: Final = 10.0
+_LONGEST_WAIT: Final = 60.0
+"""Longest time in seconds before a node that advertises and does not answer is asked again."""
 _GUESS_SECONDS: Final = 2.0
 _MOST_GUESSES: Final = 3
 _NOBODY: Final = Identity(bytes(10), NodeState.FACTORY, 0, 0, 1024, 0)
@@ -263,9 +265,13 @@ class BlePort(MeasuringLink):
         )
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
-        """Yield each node when it first advertises, and when it comes back after it was silent for 10 s."""
+        """Yield each node when it first advertises, and when it comes back after it was silent for 10 s.
+
+        A node that does not say who it is is asked again while it advertises: after 5 s, 10 s and so on to 60 s.
+        """
         notice(Notice("waiting", f"Watching for nodes over BLE ({self.spec.text})."))
         last: dict[str, float] = {}
+        silent: dict[str, tuple[float, float]] = {}  # who did not answer: when to ask again, and how long it waited
         lost = False
         while not stop.is_set():
             try:
@@ -280,12 +286,20 @@ class BlePort(MeasuringLink):
                 stop.wait(_REOPEN_SECONDS)
                 continue
             for address, at in seen.items():
-                new = at - last.get(address, -_GONE_SECONDS) >= _GONE_SECONDS
+                if at - last.get(address, -_GONE_SECONDS) >= _GONE_SECONDS:
+                    silent.pop(address, None)
+                    due = True
+                else:
+                    due = address in silent and at >= silent[address][0]
                 last[address] = time.monotonic()
-                contact = self._ask(address, _anyone, notice, set()) if new else None
+                contact = self._ask(address, _anyone, notice, set()) if due else None
                 if contact is not None:
+                    silent.pop(address, None)
                     yield contact
                     last[address] = time.monotonic()
+                elif due:
+                    wait = min(2 * silent[address][1], _LONGEST_WAIT) if address in silent else _GONE_SECONDS / 2
+                    silent[address] = (time.monotonic() + wait, wait)
                 if stop.is_set():
                     return
 

@@ -5,6 +5,7 @@ Adapter, connections, links and clock are mocks.
 
 from __future__ import annotations
 
+import itertools
 import queue
 import threading
 from collections.abc import Callable
@@ -200,6 +201,37 @@ def test_a_node_that_goes_on_advertising_while_it_is_served_is_one_visit(port: M
         visits += 1
         port.now += 30
     assert visits == 1
+
+
+def test_a_node_that_did_not_say_who_it_is_is_asked_again_while_it_advertises(port: MockPort) -> None:
+    """It was asked once, and never again as long as it went on advertising."""
+    port.heard, port.fails, port.stop_at = {ONE: 0.0}, {ONE: NodeSilentError("It is busy.")}, 310.0
+    stop = cast("threading.Event", port)
+    assert list(port.watch(stop=stop, notice=port.note)) == []
+    at = [at for at, _ in port.asked]
+    waits = [round(later - earlier) for earlier, later in itertools.pairwise(at)]
+    assert waits == [6, 10, 20, 40, 60, 60], "after 5 s, 10 s and so on to 60 s, looked at every 2 s"
+
+    def heal(notice: Notice) -> None:
+        if notice.kind == "unfinished":
+            port.fails.clear()
+
+    port.asked, port.stop_at = [], port.now + 100
+    visits = [contact.connection for contact in port.watch(stop=stop, notice=heal)]
+    assert (visits, len(port.asked)) == ([1], 2), "it answered the second time, and is one visit"
+
+
+def test_one_that_was_away_and_did_not_answer_before_is_asked_at_once(port: MockPort) -> None:
+    port.heard, port.fails, port.stop_at = {ONE: 0.0}, {ONE: NodeSilentError("It is busy.")}, 190.0
+    stop = cast("threading.Event", port)
+
+    def leave(notice: Notice) -> None:
+        if len(port.asked) == 4:  # it would be asked again after 40 s
+            port.heard = {ONE: port.now - 100 + 12}
+
+    assert list(port.watch(stop=stop, notice=leave)) == []
+    at = [at for at, _ in port.asked]
+    assert [round(later - earlier) for earlier, later in itertools.pairwise(at)][:5] == [6, 10, 20, 12, 6]
 
 
 def test_an_adapter_that_is_away_is_named_once_and_tried_again(port: MockPort) -> None:
