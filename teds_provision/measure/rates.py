@@ -12,6 +12,7 @@ from teds_provision.measure.matching import NodeLoad
 from teds_provision.measure.planning import BusTime, period_of, plan_node
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.protocol.operation.budget import MOST_LOAD
+from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
@@ -54,7 +55,7 @@ def this_machine() -> tuple[float, str]:
     except OSError:  # the system does not report it
         return VALUES, ""
     free = min(1.0, cores / (1.0 + load))
-    return VALUES * free, f"this machine is busy (load {load:.0f} on {cores} cores)" if free < 1.0 else ""
+    return VALUES * free, f"this machine is busy (load {load:.0f} on {counted(cores, 'core')})" if free < 1.0 else ""
 
 
 def lower_rate(rate: float, messages: int, lost: int) -> float:

@@ -105,7 +105,7 @@ def test_one_rate_for_all_is_no_faster_than_the_slowest_channel(station: tuple[S
         (2, 1.0, 50_000.0, ""),
         (2, 3.0, 25_000.0, "this machine is busy (load 3 on 2 cores)"),
         (8, 31.0, 12_500.0, "this machine is busy (load 31 on 8 cores)"),
-        (None, 1.0, 25_000.0, "this machine is busy (load 1 on 1 cores)"),
+        (None, 1.0, 25_000.0, "this machine is busy (load 1 on 1 core)"),
         (2, None, 50_000.0, ""),
     ],
 )
