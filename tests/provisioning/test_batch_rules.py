@@ -19,6 +19,7 @@ from teds_provision.errors import (
     NotAuthenticError,
     PolicyError,
     UsageError,
+    VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.protocol.messages.identity import NodeState
@@ -705,3 +706,25 @@ def test_a_board_of_the_bus_that_lacks_the_calibration_of_its_type_has_that_erro
     assert "has no calibration of channel 1, which its type requires." in ended.error.message
     monkeypatch.setattr(run, "_was_finished_elsewhere", lambda _node: True)
     assert run._board(answer(1), "can:test", Operator()) is None
+
+
+def test_a_vault_that_is_locked_meanwhile_ends_the_run_and_is_no_fault_of_a_board(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, done = run_of(station, whole_bus=True), SimpleNamespace(image=Image(uuid_of(1), {}))
+
+    def provision(node: Any, _operator: object, _reporter: object) -> Any:
+        if node.contact.identity.uuid != uuid_of(1):
+            raise VaultLockedError("The vault is locked.")
+        return done
+
+    monkeypatch.setattr(run, "_was_finished_elsewhere", lambda _node: False)
+    monkeypatch.setattr(run, "_provision", provision)
+    monkeypatch.setattr(run, "_at_once", lambda _port: 1)
+    port: Any = SimpleNamespace(place="can:test", close=lambda: None)
+    boards = run._side_by_side(port, [answer(1), answer(2), answer(3)], Operator())
+    first = next(boards)
+    assert (first.uuid, first.done) == (uuid_of(1), done)
+    with pytest.raises(VaultLockedError) as locked:
+        next(boards)
+    assert locked.value.exit_code == 7
