@@ -27,6 +27,8 @@ from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.visit import NodeVisit
 from teds_provision.station.station import Station
+from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.image import Image
 from tests.answers import Answers
 from tests.bench import Board, talk
 
@@ -190,3 +192,72 @@ def test_what_is_refused_before_any_node_is_waited_for(
             station, LinkSettings(), RestoreOrder(node, 1, dry_run=True), SilentReporter(), operator=Operator()
         )
     assert visits == []
+
+
+@pytest.mark.parametrize(
+    ("profile", "current", "asked"),
+    [
+        (ANGLE.profile, FINGER, True),
+        (FINGER.profile, FINGER, False),
+        ("another-type", ANGLE, False),
+        (None, FINGER, True),
+    ],
+    ids=["another type", "it differs, and is remembered as that type", "it is alike, and not remembered", "no type"],
+)
+def test_only_a_board_that_differs_and_is_not_remembered_as_that_type_is_asked_about(
+    station: Station,
+    board: Board,
+    visits: list[dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    profile: str | None,
+    current: BuildOrder,
+    asked: bool,
+) -> None:
+    """The type that the node has is not erased by a datasheet of no type."""
+    run(station, board, order=replace(current, retype=True))
+    first = history_of(station, board.uuid.hex())[1][-1]
+    monkeypatch.setattr(datasheet_history, "_record_of", lambda *_: replace(first, profile=profile))
+    questions: list[bytes] = []
+    answers = Answers(retype=lambda uuid, _differences: questions.append(uuid))
+    restored(station, RestoreOrder(board.uuid.hex(), 1), answers)
+    assert questions == ([board.uuid] if asked else [])
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert record.profile == (profile or current.profile)
+
+
+def test_a_datasheet_of_before_passes_the_guard_as_it_stands_on_the_node(
+    station: Station, board: Board, visits: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What nothing can replace on the node stays in it, in place of what the datasheet has there."""
+    fixed, other = (frame(bytes.fromhex(f"0304050d01010a01010b04000000{last}")) for last in ("01", "02"))
+    first = history_of(station, board.uuid.hex())[1][-1]
+    brought = replace(first, image=replace(first.image, blocks={**first.image.blocks, (0, 13): other}))
+    monkeypatch.setattr(datasheet_history, "_record_of", lambda *_: brought)
+    board.flash.state = replace(
+        board.state, blocks={**board.state.blocks, (0, 13): fixed}, read_only=frozenset({(0, 13)})
+    )
+    board.power_on()
+    looked: list[tuple[bytes, bytes, str]] = []
+
+    def guard(_station: Station, image: Image, present: Image, why: str) -> None:
+        looked.append((image.blocks[0, 13], present.blocks[0, 13], why))
+        raise PolicyError("It is harmful.")
+
+    monkeypatch.setattr(datasheet_history, "guard", guard)
+    with pytest.raises(PolicyError, match="harmful"):
+        restored(station, RestoreOrder(board.uuid.hex(), 1))
+    assert looked == [(fixed, fixed, "datasheet of sequence 1 brought back")]
+    assert board.state.sequence == 2
+
+
+def test_the_plan_for_a_node_whose_datasheet_is_unknown_lists_every_teds(
+    station: Station, board: Board, visits: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: None)
+    plan = restored(station, RestoreOrder(board.uuid.hex(), 1, dry_run=True))
+    assert len(plan.changes) >= len(history_of(station, board.uuid.hex())[1][-1].image.unsigned_blocks()) > 1
+    monkeypatch.setattr(type(station.datasheets), "history", lambda *_: [])
+    with pytest.raises(NotFoundError) as unknown:
+        restored(station, RestoreOrder(board.uuid.hex(), 1, dry_run=True))
+    assert unknown.value.hint == "Known are: none."

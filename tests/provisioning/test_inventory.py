@@ -14,6 +14,7 @@ from teds_provision.provisioning.inventory import NodeFit, fits_of, inventory, r
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from teds_provision.teds.fits import Fit, parse_fits
+from teds_provision.teds.origin import Origin
 from tests.bench import Board
 from tests.handover.desk import provisioned
 
@@ -112,9 +113,27 @@ def test_how_nodes_are_found(station: Station) -> None:
     assert search(station, state="keyed") == [one]
     assert search(station, state="unseen") == [three]
     assert search(station) == [one, two, three]
+    assert search(station, state="moved") == [], "no state of Identify"
+    station.nodes.remember(two, name=three.hex())
+    assert search(station, three.hex()) == [three], "a whole UUID goes before a name"
+    station.nodes.remember(two, name="facade")
+    assert search(station, "facade") == [two], "digits that are no whole UUID"
     for text in ("nobody", "ff" * 10):
         with pytest.raises(NotFoundError, match=f"^No node matches '{text}'"):
             search(station, text)
+
+
+def test_what_is_listed_of_a_node_that_was_verified(station: Station, board: Board) -> None:
+    origin = Origin("iio", "bme280").encode()
+    board.flash.state = replace(board.state, blocks={(0, 130): origin}, read_only=frozenset({(0, 130)}))
+    board.power_on()
+    provisioned(station, board)
+    (known,) = inventory(station, [board.uuid])
+    shown = known.to_json()
+    assert shown["fingerprint"] == fingerprint(board.key.point)
+    assert (shown["verdict"], shown["reading"]["from"]) == ("authentic", "session")
+    assert shown["firmware"]["state"] == "unjudged"
+    assert shown["wrapped"] == {"kind": "iio", "name": "bme280", "sha256": None}
 
 
 def test_a_datasheet_that_is_not_known_is_skipped_and_the_others_are_judged(station: Station, board: Board) -> None:

@@ -17,6 +17,7 @@ import pytest
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
+    FrozenError,
     LinkClosedError,
     NodeRefusedError,
     NodeSilentError,
@@ -888,3 +889,174 @@ def test_a_board_has_restarted_if_c_of_open_moved_by_2_to_the_32_or_more(
         return None if c is None else c.to_bytes(8, "big")
 
     assert update._same_power_up(octets(before), octets(after)) is same
+
+
+# -- where boards are met, how many at a time, and who else has them ---------------------------------------------------
+
+
+class _Ports:
+    """Ports that are opened one after the other; ``done`` has each step of an update of boards in its order."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, places: dict[bytes, tuple[str, ...]], most: int) -> None:
+        self.done: list[object] = []
+        self.asked_for: list[bytes] = []
+        self.at_once: list[int] = []
+
+        def likely_places(_station: Any, _links: LinkSettings, uuids: list[bytes]) -> tuple[str, ...]:
+            self.asked_for += uuids
+            return places.get(uuids[0], ())
+
+        def open_port(links: LinkSettings) -> Any:
+            place = f"{links.via}:{links.can or links.nfc}"
+            self.done.append(f"open {place}")
+            return SimpleNamespace(
+                capabilities=SimpleNamespace(max_parallel=most), close=lambda: self.done.append(f"close {place}")
+            )
+
+        def update_at(_station: Any, _port: Any, uuid: bytes, order: Any, reporter: Any, *, timeout: float) -> Any:
+            assert (reporter, timeout) == (uuid.hex(), 7.0)
+            return uuid, order
+
+        work = update.ParallelWork
+
+        def parallel(items: Any, one: Any, *, at_once: int, name: str) -> Any:
+            self.at_once.append(at_once)
+            return work(items, one, at_once=at_once, name=name)
+
+        patch.setattr(update, "likely_places", likely_places)
+        patch.setattr(update, "open_port", open_port)
+        patch.setattr(update, "avoid_measuring_source", lambda _station, _port, uuid: self.done.append(uuid[-1]))
+        patch.setattr(update, "update_at", update_at)
+        patch.setattr(update, "ParallelWork", parallel)
+
+    def updated(self, orders: list[tuple[bytes, Any]], parallel: int, **links: Any) -> list[Any]:
+        none: Any = None
+        told: Any = bytes.hex
+        settings = LinkSettings(timeout=7.0, **links)
+        found: list[Any] = []
+        for board in update.update_boards(none, settings, orders, told, parallel=parallel):
+            found.append(board)
+            self.done.append("end")
+        return found
+
+
+A, B, C, D = (bytes(9) + bytes([number]) for number in range(4))
+
+
+def test_boards_are_updated_bus_by_bus_where_each_was_met_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each port is closed before the next is opened; the own source address is looked at for every board of a port."""
+    places = {A: ("can:a", "can:b"), B: ("can:b",), C: ("can:a",)}
+    orders: list[tuple[bytes, Any]] = [(uuid, f"order {uuid[-1]}") for uuid in (A, B, C, D)]
+    ports = _Ports(monkeypatch, places, 8)
+    assert ports.updated(orders, 1) == [orders[0], orders[2], orders[1], orders[3]]
+    assert ports.done == [
+        *("open can:a", 0, 2, "end", "end", "close can:a"),
+        *("open can:b", 1, "end", "close can:b"),
+        *("open nfc:None", 3, "end", "close nfc:None"),
+    ]
+    assert ports.asked_for == [A, B, C, D]
+    ports = _Ports(monkeypatch, places, 8)
+    assert ports.updated(orders, 1, nfc="usb") == orders
+    assert ports.asked_for == [], "a reader that is configured is waited at"
+    assert ports.done[0] == "open nfc:usb"
+
+
+@pytest.mark.parametrize(
+    ("parallel", "most", "boards", "at_once"),
+    [(4, 8, 3, [3]), (2, 8, 3, [2]), (4, 2, 3, [2]), (1, 8, 3, []), (4, 1, 3, []), (4, 8, 1, [])],
+    ids=["all", "as asked", "as the link bears", "one asked", "the link bears one", "one board"],
+)
+def test_as_many_boards_at_a_time_as_were_asked_for_and_as_the_link_bears(
+    parallel: int, most: int, boards: int, at_once: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders: list[tuple[bytes, Any]] = [(uuid, "order") for uuid in (A, B, C)[:boards]]
+    ports = _Ports(monkeypatch, {}, most)
+    assert sorted(ports.updated(orders, parallel)) == orders
+    assert ports.at_once == at_once
+    assert ports.done[-1] == "close nfc:None"
+
+
+def test_who_stops_an_update_of_many_boards_begins_no_further_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = _Ports(monkeypatch, {}, 2)
+    dropped: list[bool] = []
+    work: Any = SimpleNamespace(
+        results=lambda: iter([SimpleNamespace(result=lambda: "first"), SimpleNamespace(result=lambda: "second")]),
+        drop_waiting=lambda: dropped.append(True),
+    )
+    monkeypatch.setattr(update, "ParallelWork", lambda *_args, **_more: work)
+    none: Any = None
+    running = update.update_boards(none, LinkSettings(), [(A, none), (B, none)], none, parallel=2)
+    assert next(running) == "first"
+    running.close()  # type: ignore[attr-defined]
+    assert dropped == [True]
+    assert ports.done[-1] == "close nfc:None"
+
+
+def test_a_board_that_does_not_measure_has_no_actuator_in_use() -> None:
+    def refuse(_command: object, _doing: object) -> bytes:
+        raise NodeRefusedError("It is unknown.", reason=1)
+
+    node: Any = SimpleNamespace(request_idempotent=refuse)
+    update.require_free_actuators(node)
+
+
+def test_a_board_that_is_measured_is_updated_only_if_it_was_let_go(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench.station.measurements, "holder", lambda _uuid: "crane")
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error), done.octets) == ("refused", FrozenError, 0)
+    assert bench.runs == ("1.0.0", False, False)
+    let_go: list[bytes] = []
+
+    def release(uuid: bytes) -> Any:
+        let_go.append(uuid)
+        return nullcontext(True)
+
+    port: Any = BenchPort(bench)
+    order = UpdateOrder(owner.new, wait=5.0)
+    done = update_at(bench.station, port, bench.uuid, order, SilentReporter(), timeout=1.0, release=release)
+    assert (done.result, let_go) == ("updated", [bench.uuid])
+
+
+def test_a_plan_of_a_board_that_is_measured_needs_a_service_that_lets_it_go(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.station.unlock()
+    closed: list[bool] = []
+    monkeypatch.setattr(BenchPort, "close", lambda _port: closed.append(True))
+    holder, serves = "crane", False
+    monkeypatch.setattr(bench.station.measurements, "holder", lambda _uuid: holder)
+    bench.station.service_runs = lambda: serves
+
+    def planned(image: FirmwareImage) -> Any:
+        links = LinkSettings("can", via_chosen=True)
+        with bench.patched():
+            return update.plan_or_refusal(bench.station, links, bench.uuid, UpdateOrder(image), SilentReporter())
+
+    refused = planned(owner.new)
+    assert (refused.result, refused.before, refused.octets) == ("refused", "1.0.0", 0)
+    assert refused.error.message == f"Node {bench.uuid.hex()} is being measured by crane."
+    serves = True
+    assert planned(owner.new).interrupts == ("crane",)
+    holder, serves = None, False  # type: ignore[assignment]
+    assert planned(owner.new).interrupts == ()
+    assert closed == [True] * 3
+
+
+def test_an_update_begins_with_free_actuators_and_a_board_that_runs_the_image_is_noted(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_node: Conversation) -> None:
+        raise PolicyError("Actuator 7 of the board is in use.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(update, "require_free_actuators", refuse)
+        done = bench.update(owner.new)
+        assert (done.result, done.octets, bench.runs) == ("refused", 0, ("1.0.0", False, False))
+    bench.station.firmware_reports.forget(bench.uuid)
+    assert bench.update(owner.old).result == "already"
+    known = firmware_of(bench.station, bench.uuid)
+    assert known is not None
+    assert known.reading.report is not None
+    assert known.reading.report.image == owner.old.digest
