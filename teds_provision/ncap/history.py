@@ -56,7 +56,9 @@ class _Meaning:
         """Return it; a calibration that was only dated or documented again is the same one."""
         calibration = facts.calibration
         if calibration is not None:
-            calibration = replace(calibration, date=None, zeroed=None, interval=None, points=(), by="")
+            calibration = replace(
+                calibration, date=None, zeroed=None, interval=None, points=(), by="", certificate=None
+            )
         turn = (facts.low, facts.high) if facts.full_turn else None
         return cls(facts.unit, facts.units, calibration, turn, facts.unsigned, raw)
 

@@ -6,6 +6,8 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from teds_provision.measure.blocks import Block, ChannelFacts
 from teds_provision.ncap.bins import Bins, FewBins
 from teds_provision.ncap.history import HOUR, History
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
+from teds_provision.teds.certificate import CertificateReference
+from teds_provision.teds.units import parse_units
 
 NODE = "8d4d9da65281f7000000"
 NOW = float(int(time.time()))
@@ -294,3 +298,133 @@ def test_a_raw_integer_that_no_float_can_hold_is_a_gap_and_ends_no_history() -> 
     history = past.channel_history(NODE, 1, NOW - 60, NOW + 60)
     assert (history["low"], history["high"]) == ([None, 7.0], [None, 7.0])
     assert history["segments"] == [{"id": history["segment"][0], "unit": "", "raw": True}]
+
+
+CALIBRATED = ChannelFacts(
+    NODE, "", 1, "a", unit="rad", units=parse_units("rad"), low=0.0, high=6.283185307179586,
+    calibration=Calibration(1, "linear", (CalibrationInput(1, 1, (0.0, 65536.0), (0.0,)),), (0.0, 1e-4)),
+)  # fmt: skip
+DAY = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+@pytest.mark.parametrize(
+    ("facts", "calibration", "raw", "another"),
+    [
+        ({}, {"date": DAY}, False, False),
+        ({}, {"zeroed": DAY}, False, False),
+        ({}, {"interval": 86400.0}, False, False),
+        ({}, {"points": ((0.0, 0.0),)}, False, False),
+        ({}, {"by": "another"}, False, False),
+        ({}, {"certificate": CertificateReference("7", "lab", "2026-03-01", "ab" * 32)}, False, False),
+        ({"due": "2027-03-01", "fingerprint": "ab" * 32, "uncertainty": 0.5, "name": "b"}, {}, False, False),
+        ({}, {"zero_offset": 0.5}, False, True),
+        ({}, {"coefficients": (0.0, 2e-4)}, False, True),
+        ({"unit": "°"}, {}, False, True),
+        ({"units": parse_units("m")}, {}, False, True),
+        ({"calibration": None}, {}, False, True),
+        ({"low": -3.141592653589793, "high": 3.141592653589793}, {}, False, True),
+        ({"high": 3.0}, {}, False, True),
+        ({"unsigned": True}, {}, False, True),
+        ({}, {}, True, True),
+    ],
+)
+def test_a_segment_begins_where_values_mean_something_else_and_nowhere_else(
+    facts: dict[str, Any], calibration: dict[str, Any], raw: bool, another: bool
+) -> None:
+    past = History()
+    past.learn([CALIBRATED])
+    past.block(block(NOW - 9, [[1.0]] * 10))
+    assert CALIBRATED.calibration is not None
+    changed = replace(CALIBRATED, **{"calibration": replace(CALIBRATED.calibration, **calibration), **facts})
+    past.learn([changed], raw={(NODE, 1)} if raw else ())
+    past.block(block(NOW - 5, [[2.0]] * 10))
+    history = past.channel_history(NODE, 1, NOW - 600, NOW)
+    assert history["segment"] == [0, int(another)]
+    last = {"id": 1, "unit": "", "raw": True} if raw else {"id": int(another), "unit": facts.get("unit", "rad")}
+    assert history["segments"][-1] == last
+
+
+def test_limits_of_a_channel_that_does_not_wrap_are_no_meaning() -> None:
+    past = History()
+    for at, high in ((NOW - 9, 1.0), (NOW - 5, 2.0)):
+        past.learn([replace(CALIBRATED, high=high)])
+        past.block(block(at, [[1.0]]))
+    assert past.channel_history(NODE, 1, NOW - 600, NOW)["segment"] == [0, 0]
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_values_of_a_channel_without_calibration_are_its_raw_numbers_and_none_of_them_is_a_gap(many: bool) -> None:
+    """They are marked as not valid, for nobody says what they mean."""
+    count = 400 if many else 4
+    past = History()
+    past.learn([CALIBRATED, replace(CALIBRATED, number=2, calibration=None)], raw={(NODE, 2)})
+    bare = block(NOW - 8, [[5.0, 7.0]] * count, valid=[[False, False]] * count)
+    past.block(replace(bare, value=np.full((count, 2), np.nan)))
+    for number, value in ((1, None), (2, 7.0)):
+        history = past.channel_history(NODE, number, NOW - 600, NOW)
+        assert (history["low"][0], history["high"][0], sum(history["invalid"])) == (value, value, count)
+
+
+def test_what_is_lost_counts_in_the_second_of_the_sample_behind_the_gap() -> None:
+    """Of the stream in which it was lost; one that came twice makes no loss of less than nothing."""
+    past = History()
+    past.block(block(NOW - 9, [[1.0]] * 5, index=0))
+    past.block(block(NOW - 7.99, [[1.0]] * 300, index=9))  # 4 before it, and the block takes three seconds
+    past.block(replace(block(NOW - 4, [[1.0]] * 5, index=500), channels=(2,), stream=2))
+    past.block(
+        replace(block(NOW - 3.5, [[1.0]] * 5, index=600), channels=(3,), stream=1)
+    )  # another stream of that number
+    past.block(replace(block(NOW - 3, [[1.0]] * 5, index=100), channels=(3,), stream=1))
+    lost = [past.channel_history(NODE, number, NOW - 600, NOW)["lost"] for number in (1, 2, 3)]
+    assert (lost[0][:3], sum(lost[0]), sum(lost[1]), sum(lost[2])) == ([0, 4, 0], 4, 0, 0)
+    past.block(replace(block(NOW - 2, [[1.0]] * 5, index=105), channels=(3,), stream=1, test_pattern=True))
+    assert sum(past.channel_history(NODE, 3, NOW - 600, NOW)["count"]) == 10, "a test pattern is no measurement"
+
+
+def test_times_that_go_back_within_a_block_go_no_further_back_than_the_sample_before() -> None:
+    for count in (4, 40):
+        past = History()
+        times = NOW - 8 + np.arange(count) / 1000
+        times[1] -= 3.0
+        past.block(replace(block(NOW - 8, [[1.0]] * count), time=times))
+        assert past.channel_history(NODE, 1, NOW - 600, NOW)["time"] == [NOW - 8]
+
+
+def test_an_hour_is_shown_unless_less_is_asked_for_and_no_more_bins_than_were_asked_for() -> None:
+    past = History()
+    for seconds in (3601.0, 3599.0, 100.0, 30.0):
+        past.block(block(NOW - seconds, [[seconds]], rate=1.0))
+    whole = past.channel_history(NODE, 1, until=NOW, points=3600)
+    assert (whole["since"], whole["until"], whole["bin"]) == (NOW - 3600, NOW, 1.0)
+    assert whole["time"] == [NOW - 3599, NOW - 100, NOW - 30]
+    assert past.channel_history(NODE, 1, NOW - 61, NOW - 1)["bin"] == pytest.approx(0.06), "31 s in 600 parts"
+    assert past.channel_history(NODE, 1, NOW - 100, NOW - 1)["bin"] == 1.0, "longer ago than a minute"
+    assert past.channel_history(NODE, 1, NOW - 3600, NOW - 3500)["bin"] == 1.0
+    thin = past.channel_history(NODE, 1, NOW - 3600, NOW, points=1000)
+    assert thin["bin"] == 4.0, "3,571 seconds by 1,000: a bin of three seconds would be too short"
+
+
+@pytest.mark.parametrize("at_once", [1, 100])
+def test_a_sample_at_the_edge_of_a_bin_is_in_the_bin_that_begins_there(at_once: int) -> None:
+    """A hundredth is no binary fraction: by its quotient alone every third sample would be in the bin before."""
+    past = History()
+    first = NOW - 5
+    times = [first + place / 100 for place in range(100)]
+    for place in range(0, 100, at_once):
+        one = block(first, [[1.0]] * at_once, index=place)
+        past.block(replace(one, time=np.array(times[place : place + at_once])))
+    fine = past.channel_history(NODE, 1, NOW - 6, NOW - 3, points=600)
+    assert (fine["count"], fine["time"]) == ([1] * 100, [round(moment, 3) for moment in times])
+    past = History()
+    past.block(replace(block(first, [[1.0]]), time=np.array([first - 2e-7])))
+    assert past.channel_history(NODE, 1, NOW - 600, NOW)["time"] == [first]
+
+
+def test_what_waits_is_taken_in_by_who_brings_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("teds_provision.ncap.history._WAITING", 3)
+    past = History()
+    held = []
+    for place in range(5):
+        past.block(block(NOW - 5 + place / 100, [[1.0]], index=place))
+        held.append(len(past._waiting))
+    assert held == [1, 2, 3, 0, 1]

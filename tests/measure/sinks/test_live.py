@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from teds_provision.measure.blocks import (
     ECHO,
     Block,
     ChannelFacts,
+    ClockSet,
     GroupRows,
     InvalidValues,
     NodeReport,
@@ -754,8 +756,248 @@ def test_the_state_of_joints_is_what_their_sensors_or_else_their_set_points_say(
     newest = {(HAND, 1): 0.09, (HAND, 2): 0.05, (HAND, 3): 4.0, (HAND, 12): 0.06}
     assert state_of([first, second], newest) == ([first.name, second.name], [0.05, 0.06], [], [])
     assert state_of([first], newest) == ([first.name], [0.05], [], [4.0])
+    assert joints_of(list(reversed(pair)), topics) == [first, second], "by number, in whatever order they are known"
     bare = replace(first, state={})
     assert state_of([bare], newest) == ([first.name], [0.09], [], []), "what was applied"
     assert state_of([replace(first, command="effort", state={"effort": 3})], newest) == ([], [], [], [])
     marked = [replace(facts, unverified=True) for facts in gripper()]
     assert joints_of(marked, topics) == [], "no set point moves what is not signed"
+
+
+def processed(sink: Carrier, *items: Any) -> Carrier:
+    """Give a sink items on this thread."""
+    for item in items:
+        sink._process_item(item)
+    return sink
+
+
+def row_at(stamp: float, *values: float) -> GroupRows:
+    """Return one row of angle and force, which are a second and two seconds old."""
+    keys = (ANGLE.key, FORCE.key)[: len(values)]
+    return GroupRows("crane", keys, np.array([stamp]), np.array([values]), np.array([[1.0, 2.0][: len(values)]]))
+
+
+def prepared(*facts: ChannelFacts, station: StationFacts = STATION, commands: Any = None) -> Carrier:
+    """Return a carrier without its thread."""
+    sink = Carrier(commands)
+    sink._prepare(facts, station)
+    return sink
+
+
+def test_rows_go_on_when_the_clock_was_set_back() -> None:
+    sink = processed(prepared(ANGLE, FORCE), row_at(2000.0, 1.0, 2.0), row_at(1500.0, 1.0, 2.0))
+    assert [(topic, stamp) for topic, stamp, *_ in sink.arrays] == [
+        ("/bench/crane", 2000.0),
+        ("/bench/crane/age", 2000.0),
+    ]
+    processed(sink, ClockSet(1000.0, -1000.0), row_at(1001.0, 3.0, 4.0))
+    assert sink.arrays[2:] == [
+        ("/bench/crane", 1001.0, ["arm/angle", "hand/force"], [3.0, 4.0]),
+        ("/bench/crane/age", 1001.0, ["arm/angle", "hand/force"], [1.0, 2.0]),
+    ]
+
+
+@pytest.mark.parametrize("each_node", [False, True])
+def test_a_channel_that_is_called_otherwise_is_called_so_in_every_message_from_then_on(each_node: bool) -> None:
+    sink = prepared(ANGLE, station=replace(STATION, each_node=each_node))
+    row = replace(row_at(1.0, 1.0), group=ARM if each_node else "crane")
+    processed(sink, block(), row, (replace(ANGLE, name="elbow", units=parse_units("K")),), block())
+    processed(sink, replace(row, time=np.array([2.0])))
+    assert [(topic, kind) for topic, kind, *_ in sink.scalars] == [
+        ("/bench/arm/angle", "std_msgs/Float64"), ("/bench/arm/elbow", "sensor_msgs/Temperature"),
+    ]  # fmt: skip
+    assert [names for _, _, names, _ in sink.arrays] == [["arm/angle"]] * 2 + [["arm/elbow"]] * 2
+    assert {topic for topic, *_ in sink.arrays} == (
+        {"/bench/arm/array", "/bench/arm/array/age"} if each_node else {"/bench/crane", "/bench/crane/age"}
+    )
+
+
+def test_metadata_has_every_channel_of_its_node_and_each_frame_filled_in_also_if_one_alone_changed() -> None:
+    second = replace(ANGLE, number=2, name="other", frame="{node}_tip")
+    station = replace(STATION, name="Bench 1", clock="a clock of its own", test_pattern=False)
+    sink = processed(prepared(ANGLE, second, station=station), (replace(ANGLE, name="elbow"),))
+    words = json.loads(sink.words["/bench_1/arm/teds"])
+    assert [(one["name"], one["topic"], one.get("frame")) for one in words["channels"]] == [
+        ("elbow", "/bench_1/arm/elbow", None), ("other", "/bench_1/arm/other", "arm_tip"),
+    ]  # fmt: skip
+    assert (words["uuid"], words["station"], words["clock"]) == (ARM, "Bench 1", "a clock of its own")
+    assert words["test_pattern"] is False
+    assert set(sink.parameters) == {"/bench_1/arm/elbow", "/bench_1/arm/other"}
+    before = dict(sink.words)
+    sink.words.clear()
+    assert processed(sink, (replace(ANGLE, name="elbow"),)).words == {}, "nothing is new"
+    assert before
+
+
+def test_scalars_keep_their_beat_and_what_is_not_due_is_not_even_queued(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A delay shifts no later message; after a pause the beat begins anew."""
+    now = [0.0]
+    monkeypatch.setattr(
+        "teds_provision.measure.sinks.live.time", SimpleNamespace(monotonic=lambda: now[0], time=time.time)
+    )
+    sink, sent, queued = prepared(ANGLE), [], []
+    for now[0] in (100.0, 100.05, 100.1, 100.19, 100.2, 100.25, 101.0, 101.05, 101.1):
+        before = len(sink._items), len(sink.scalars)
+        sink.write(block())
+        queued.append(len(sink._items) - before[0])
+        processed(sink, block())
+        sent.append(len(sink.scalars) - before[1])
+    assert sent == queued == [1, 0, 1, 0, 1, 0, 1, 0, 1]
+    sink.write(replace(block(), stream=ECHO))
+    sink.write(replace(block(), stream=1))
+    assert len(sink._items) == sum(queued) + 2, "each stream has its own beat"
+    quiet = prepared(ANGLE, station=replace(STATION, scalar_rate=0.0))
+    quiet.write(block())
+    quiet.write(replace(block(), stream=ECHO))
+    assert not quiet._items, "and a set point goes to joints alone"
+
+
+def test_a_sink_counts_the_values_that_went_out_and_each_message() -> None:
+    vector = axes("m/s^2", 4)
+    sink = prepared(ANGLE, FORCE, *vector)
+    processed(sink, block([[1, 2]], [[0.5, np.nan]], [[True, False]], channels=(1, 9)))
+    assert (sink.stats.written, sink.stats.messages) == (1, 1)
+    processed(sink, row_at(1.0, 1.0, np.nan))
+    assert (sink.stats.written, sink.stats.messages) == (2, 3), "the row, and its age"
+    processed(sink, replace(block([[1, 2, 3]], channels=(4, 5, 6)), stream=1))
+    assert (sink.stats.written, sink.stats.messages) == (8, 7), "three values, and once more together"
+    hand = prepared(*gripper())
+    rows = GroupRows("crane", ((HAND, 2),), np.array([1.0]), np.array([[0.05]]), np.zeros((1, 1)))
+    processed(hand, rows)
+    assert (hand.stats.written, hand.stats.messages) == (1, 3), "the joints' state holds no value of its own"
+
+
+def test_a_message_of_set_points_that_is_too_short_moves_the_joints_that_it_has_a_value_for() -> None:
+    came: list[SetPointCommand] = []
+    sink = prepared(*gripper(), replace(gripper()[0], uuid=ARM, node="arm"), commands=came)
+    sink._joint_command(["hand", "arm"], [0.01], [], [])
+    assert ([(command.uuid, command.value) for command in came], sink.refused_commands) == ([(HAND, 0.01)], 1)
+
+
+def test_each_node_that_comes_and_goes_has_the_state_of_its_own_joints_alone() -> None:
+    station = replace(STATION, each_node=True)
+    sink = prepared(*gripper(), *(replace(facts, uuid=ARM, node="arm") for facts in gripper()), station=station)
+    rows = GroupRows(HAND, ((HAND, 2),), np.array([1.0]), np.array([[0.05]]), np.zeros((1, 1)))
+    processed(sink, rows, replace(rows, group=ARM, channels=((ARM, 2),), value=np.array([[0.06]])))
+    assert sink.joints == [(["hand"], [0.05], [], []), (["arm"], [0.06], [], [])]
+
+
+@pytest.mark.parametrize("vector", [(4, 5), (4, 5, 6, 7), (5, 6, 4)])
+def test_a_vector_has_three_members_in_the_order_of_the_meta_teds(vector: tuple[int, ...]) -> None:
+    known = [replace(facts, vector=vector) for facts in [*axes("T", 4), replace(axes("T", 7)[0], number=7)]]
+    found = compounds_of(facts for facts in known if facts.number in vector)
+    assert [compound.parts for compound in found] == (
+        [(("magnetic_field.x", 5), ("magnetic_field.y", 6), ("magnetic_field.z", 4))] if len(vector) == 3 else []
+    )
+
+
+def test_more_vectors_of_one_kind_than_of_the_other_make_a_message_each() -> None:
+    found = compounds_of([*axes("m/s^2", 1), *axes("m/s^2", 4), *axes("rad/s", 7)])
+    assert [(compound.name, [number for _, number in compound.parts]) for compound in found] == [
+        ("imu_1", [1, 2, 3, 7, 8, 9]), ("imu_4", [4, 5, 6]),
+    ]  # fmt: skip
+    assert found[1].fixed["angular_velocity_covariance"] == [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    mixed = [*axes("T", 1)[:2], replace(axes("N", 1)[2])]
+    assert compounds_of(mixed) == [], "its axes have one unit"
+    assert compounds_of(replace(facts, kind="actuator") for facts in axes("T", 1)) == []
+
+
+@pytest.mark.parametrize("kind", ["velocity", "effort"])
+def test_a_set_point_stands_for_the_state_that_it_commands_and_for_no_other(kind: Any) -> None:
+    [joint] = joints_of(gripper(), Topics(STATION))
+    state = replace(joint, command=kind, state={"position": 2})
+    given = state_of([state], {(HAND, 1): 0.3, (HAND, 2): 0.05})
+    assert given == ([joint.name], [0.05], *(([0.3], []) if kind == "velocity" else ([], [0.3])))
+
+
+# -- names -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [("a" * 59 + " b", "a" * 59), ("a" * 61, "a" * 60), ("3 axes", "n_3_axes"), ("--", ""), ("A__b-", "a_b")],
+)
+def test_a_name_is_cut_after_sixty_letters_and_begins_with_one(text: str, part: str) -> None:
+    assert slug(text) == part
+
+
+@pytest.mark.parametrize(
+    ("frame", "is_one"),
+    [("a" * 60, True), ("a" * 61, False), ("base_link", True), ("map/arm_1", True), ("1a", False), ("a//b", False),
+     ("a/", False), ("", False), ("a b", False)],
+)  # fmt: skip
+def test_a_frame_is_a_name_of_sixty_letters_at_most(frame: str, is_one: bool) -> None:
+    assert names.is_frame(frame) is is_one
+
+
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [("array", "array_1"), ("teds", "teds_1"), ("state", "state_1"), ("status", "status_1"), ("age", "age_1"),
+     ("cmd", "cmd_1"), ("stream", "stream_ch1"), ("stream_0", "stream_0_1"), ("imu", "imu_ch1"), ("imu_2", "imu_2_1"),
+     ("magnetic_field", "magnetic_field_ch1"), ("wrench_12", "wrench_12_1"), ("images", "images")],
+)  # fmt: skip
+def test_a_channel_with_a_reserved_name_has_its_number_behind_it(name: str, own: str) -> None:
+    topics = Topics(STATION)
+    topics.learn([replace(ANGLE, name=name)])
+    assert topics.channel(ARM, 1) == f"/bench/arm/{own}"
+
+
+@pytest.mark.parametrize("name", ["all", "reports", "status", "unverified", "joint_states", "joint_commands"])
+def test_a_node_with_a_reserved_name_has_its_digits_behind_it(name: str) -> None:
+    topics = Topics(replace(STATION, nodes={ARM: name}))
+    assert topics.node(ARM) == f"{name}_8d4d9da6"
+    group = topics.of_group(name)
+    assert group == (f"/bench/{name}_group" if name.startswith("joint_") else f"/bench/{name}")
+    assert (topics.of_group(""), Topics(StationFacts("--")).of_group("x")) == ("/bench/all", "/station/x")
+
+
+def test_names_that_are_chosen_while_a_node_is_measured_count_until_they_are_taken_back() -> None:
+    topics = Topics(STATION)
+    topics.learn([ANGLE, replace(ANGLE, number=2, name="boom"), FORCE])
+    for chosen, first, second in (
+        (((1, "bench/arm/boom"),), "/bench/arm/boom", "/bench/arm/boom_2"),
+        (((1, "crane/boom"),), "/crane/boom", "/bench/arm/boom"),
+        (((1, "/crane/jib/"),), "/crane/jib", "/bench/arm/boom"),
+        (((0, "left"), (1, "crane/jib")), "/crane/jib", "/bench/left/boom"),
+        ((), "/bench/arm/angle", "/bench/arm/boom"),
+    ):
+        touched = topics.learn([replace(ANGLE, chosen=chosen)])
+        assert (topics.channel(ARM, 1), topics.channel(ARM, 2), touched) == (first, second, {ARM})
+    assert topics.channel(HAND, 2) == "/bench/hand/force"
+
+
+def test_a_stranger_that_joins_renames_its_namesake_and_both_are_reported() -> None:
+    topics = Topics(STATION)
+    other = "f" * 20
+    assert topics.learn([replace(ANGLE, siblings=((7, "tip"),))]) == {ARM}
+    assert (topics.channel(ARM, 1), topics.channel(ARM, 7)) == ("/bench/arm/angle", "/bench/arm/tip")
+    assert topics.learn([replace(ANGLE, uuid=other)]) == {ARM, other}
+    assert (topics.channel(ARM, 1), topics.channel(other, 1)) == (
+        "/bench/arm_8d4d9da6/angle", "/bench/arm_ffffffff/angle",
+    )  # fmt: skip
+    claw = replace(FORCE, uuid="c" * 20)
+    assert topics.learn([replace(claw, unverified=True, node="arm")]) == {claw.uuid}
+    assert topics.channel(*claw.key) == "/bench/unverified/arm/force"
+    assert topics.learn([replace(claw, node="claw")]) == {claw.uuid}
+    assert topics.channel(*claw.key) == "/bench/claw/force", "it is signed by now"
+
+
+@pytest.mark.parametrize(
+    ("name", "by"),
+    [
+        ("diagnostics", "something else"), ("tf/x", "something else"), ("clock", "something else"),
+        ("bench/crane", "something else"), ("bench/x/teds", "something else"), ("bench/x/imu_3", "something else"),
+        ("bench/x/cmd", "something else"), ("bench/hand/force", f"channel 2 of node {HAND}"),
+        ("/bench/hand/force/", f"channel 2 of node {HAND}"), ("crane/jib", f"channel 3 of node {HAND}"),
+        ("crane/jib/cmd", f"channel 3 of node {HAND}"), ("bench/arm/other", f"channel 2 of node {ARM}"),
+        ("bench/arm/angle", ""), ("bench/x/teds_1", ""), ("other/crane", ""), ("crane/jib_2", ""),
+    ],
+)  # fmt: skip
+def test_what_stands_for_something_else_cannot_be_chosen_for_a_channel(name: str, by: str) -> None:
+    topics = Topics(replace(STATION, names={(HAND, 3): "crane/jib"}))
+    topics.learn([ANGLE, replace(ANGLE, number=2, name="other"), FORCE, replace(FORCE, number=3)])
+    if not by:
+        topics.require_free(ARM, 1, name)
+        return
+    with pytest.raises(UsageError, match=f"is the topic of {by} already"):
+        topics.require_free(ARM, 1, name)

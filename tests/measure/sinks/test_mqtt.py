@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import TedsProvisionError, UsageError
+from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.sinks import mqtt, open_sink
 from teds_provision.measure.sinks.mqtt import MqttSink
@@ -476,3 +476,237 @@ def test_what_is_announced_and_the_state_are_retained_and_values_are_not() -> No
         },
     ]
     assert values["unverified"] is True
+
+
+class Library:
+    """Stands for paho's client and keeps each call; mock, no connection is made."""
+
+    def __init__(self, *_: object, client_id: str = "") -> None:
+        self.called: list[tuple[str, tuple[object, ...], dict[str, object]]] = [("id", (client_id,), {})]
+        self.rc = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *words, **more: (self.called.append((name, words, more)), SimpleNamespace(rc=self.rc))[1]
+
+    def of(self, name: str) -> list[tuple[tuple[object, ...], dict[str, object]]]:
+        """Return what was given to one of its functions, and forget it."""
+        found = [(words, more) for called, words, more in self.called if called == name]
+        self.called = [call for call in self.called if call[0] != name]
+        return found
+
+
+ONLINE = (("bench/arm_7/status", "online"), {"qos": 1, "retain": True})
+
+
+def with_library(monkeypatch: pytest.MonkeyPatch, spec: str, *facts: ChannelFacts) -> tuple[MqttSink, Any]:
+    """Return a sink that has begun, and its library; the measurement's instance is "Arm 7"."""
+    monkeypatch.setattr("paho.mqtt.client.Client", Library)
+    sink = MqttSink(spec)
+    sink._prepare(facts, replace(STATION, instance="Arm 7"))
+    sink._begin()
+    return sink, sink._client
+
+
+def connected(sink: MqttSink) -> None:
+    """Let the broker take the client."""
+    sink._on_connect(None, None, None, SimpleNamespace(is_failure=False), None)
+
+
+@pytest.mark.parametrize(
+    ("spec", "host", "port"),
+    [
+        ("mqtt://lab", "lab", 1883),
+        ("mqtt://lab:1884", "lab", 1884),
+        ("mqtts://lab", "lab", 8883),
+        ("mqtt://[::1]", "::1", 1883),
+    ],
+)
+def test_the_broker_learns_at_the_connection_what_it_says_when_the_station_is_gone(
+    spec: str, host: str, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``offline``, retained, and with a receipt; each measurement under its own name and its own client."""
+    (sink, library), (_, other) = (with_library(monkeypatch, spec) for _ in range(2))
+    assert library.of("will_set") == [(("bench/arm_7/status", "offline"), {"qos": 1, "retain": True})]
+    assert library.of("connect_async") == [((host, port, 15), {})]
+    assert library.of("reconnect_delay_set") == [((1, 30), {})]
+    assert library.of("id") != other.of("id")
+    assert (sink.stats.state, sink.stats.detail) == ("waiting", f"waiting for the broker at {host}")
+    assert not library.of("username_pw_set")
+
+
+@pytest.mark.parametrize(
+    ("octets", "password"),
+    [(b"secret", "secret"), (b" se cret \n", " se cret "), (b"secret\r\n", "secret"), ("sécrèt\n".encode(), "sécrèt")],
+)
+def test_a_password_is_the_files_text_without_its_last_line_end(
+    octets: bytes, password: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "password").write_bytes(octets)
+    _, library = with_library(monkeypatch, f"mqtt://arm@lab?password-file={tmp_path}/password")
+    assert library.of("username_pw_set") == [(("arm", password), {})]
+    _, library = with_library(monkeypatch, "mqtt://arm@lab")
+    assert library.of("username_pw_set") == [(("arm", None), {})]
+    (tmp_path / "password").write_bytes(b"\xff\xfe")
+    with pytest.raises(BadDataError, match="is not UTF-8 text"):
+        with_library(monkeypatch, f"mqtt://arm@lab?password-file={tmp_path}/password")
+
+
+def test_each_connection_announces_the_measurement_and_every_channel_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A broker that was started again may have lost what it retained."""
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    config = f"homeassistant/sensor/{ARM}/1/config"
+    sink._idle(0.0)
+    assert library.of("publish") == [], "nothing before there is a connection"
+    for _ in range(2):
+        connected(sink)
+        sink._idle(0.0)
+        first, second = library.of("publish")
+        assert first == ONLINE
+        assert (second[0][0], second[1]) == (config, {"qos": 1, "retain": True})
+        assert (sink.stats.state, sink.stats.detail) == ("running", "connected to lab")
+        sink._idle(0.0)
+        assert library.of("publish") == []
+        sink._on_disconnect(None, None, None, "Unspecified error", None)
+        assert (sink.stats.state, sink.stats.detail) == ("waiting", "the broker at lab disconnected")
+        sink._process_item((OIL,))
+        assert library.of("publish") == []
+        sink._facts.pop(OIL.key)
+        sink._owed_entities.clear()
+
+
+def test_what_a_full_library_did_not_take_is_announced_later_in_its_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    assert library.of("max_queued_messages_set") == [((1000,), {})]
+    library.rc = 15
+    connected(sink)
+    sink._process_item((OIL,))
+    assert library.of("publish") == [ONLINE], "no channel before the measurement"
+    assert (sink.stats.state, sink.stats.messages) == ("waiting", 0)
+    library.rc = 0
+    sink._idle(0.0)
+    topics = [words[0] for words, _ in library.of("publish")]
+    assert topics == [
+        "bench/arm_7/status",
+        *(f"homeassistant/sensor/{key}/config" for key in (f"{ARM}/1", f"{HAND}/3")),
+    ]
+    assert sink.stats.messages == 2
+
+
+def test_an_entity_has_name_unit_and_device_of_the_datasheet() -> None:
+    """Also where the datasheet has no name or a unit that is not shown otherwise; without a unit there is none."""
+    nameless = replace(ANGLE, node="", name="", unit="")
+    sink, client = desk_sink(nameless, replace(FORCE, name="Kraft [N] }}"))
+    sink._announce()
+    first, second = (json.loads(octets) for _, octets in client.published)
+    assert first["device"] == {
+        "identifiers": [ARM], "name": ARM, "manufacturer": "IEEE 1451 transducer",
+        "sw_version": first["device"]["sw_version"],
+    }  # fmt: skip
+    assert first["device"]["sw_version"].startswith("teds-provision ")
+    assert (first["value_template"], "unit_of_measurement" in first) == ("{{ value_json.ch_1 }}", False)
+    assert first["availability_mode"] == "all"
+    assert (second["device"]["identifiers"], second["device"]["name"]) == ([HAND], "hand")
+    assert (second["unit_of_measurement"], second["name"]) == ("N", "Kraft [N] }}")
+    assert second["value_template"] == "{{ value_json.kraft_n_2 }}", "a template is a program"
+
+
+@pytest.mark.parametrize("mark", ["unsigned", "unverified"])
+def test_values_are_marked_if_one_of_their_channels_is_and_each_node_has_its_own_beat(mark: str) -> None:
+    marked: dict[str, Any] = {mark: True}
+    sink, client = desk_sink(ANGLE, replace(ANGLE, number=2, name="other", **marked), FORCE)
+    for _ in range(2):
+        sink._process_item(block([[1, 2]], channels=(1, 2)))
+        sink._process_item(block(uuid=HAND, channels=(2,)))
+    arm, hand = (json.loads(octets) for _, octets in client.published)
+    assert (arm[mark], mark in hand) == (True, False)
+    assert (sink.stats.written, sink.stats.messages) == (3, 2)
+    assert sink.stats.octets == sum(len(octets) for _, octets in client.published)
+    sink._connected.clear()
+    sink._due.clear()
+    sink._process_item(block([[1, 2]], channels=(1, 2)))
+    assert (sink.stats.dropped, sink.stats.written, len(client.published)) == (2, 3, 2)
+
+
+def test_the_state_of_a_node_has_its_counters() -> None:
+    sink, client = desk_sink(ANGLE)
+    sink._process_item(NodeReport(ARM, "lost", "no frame", samples=9, lost=1, late=2, bad=3, invalid=4))
+    [(topic, octets)] = client.published
+    words = json.loads(octets)
+    assert (topic, words["state"], words["why"]) == ("bench/arm/state", "lost", "no frame")
+    assert [words[name] for name in ("samples", "lost", "late", "bad", "invalid")] == [9, 1, 2, 3, 4]
+
+
+def test_two_nodes_that_swap_their_names_lose_neither_state() -> None:
+    """The old topic of one is the new one of the other: nothing is to be removed."""
+    sink, client = desk_sink(replace(ANGLE, chosen=((0, "left"),)), replace(FORCE, chosen=((0, "right"),)))
+    sink._announce()
+    client.published.clear()
+    sink._process_item((replace(ANGLE, chosen=((0, "right"),)), replace(FORCE, chosen=((0, "left"),))))
+    assert not [topic for topic, octets in client.published if octets == b""]
+    assert len(client.published) == 2
+
+
+@pytest.mark.parametrize(
+    ("scheme", "connected_before", "reason", "words"),
+    [
+        ("mqtt", False, "x", "the broker at lab:7 closed the connection without answering; it may expect TLS (mqtts://)"),
+        (
+            "mqtts", False, "x",
+            "the broker at lab:7 closed the connection without answering; it may expect a different client certificate"
+            " (cert=, key=)",
+        ),
+        ("mqtt", False, "Keep alive timeout", "the broker at lab:7 has been silent for 15 s"),
+        ("mqtt", True, "Keep alive timeout", "the broker at lab disconnected"),
+    ],
+)  # fmt: skip
+def test_why_a_connection_ended_is_reported_and_kept(
+    scheme: str, connected_before: bool, reason: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sink, library = with_library(monkeypatch, f"{scheme}://lab:7")
+    if connected_before:
+        connected(sink)
+    sink._on_disconnect(None, None, None, reason, None)
+    assert (sink.stats.state, sink.stats.detail) == ("waiting", words)
+    if not connected_before:
+        sink._waits("nothing is listening at lab:7")
+        sink._on_disconnect(None, None, None, "another", None)
+        assert sink.stats.detail == "nothing is listening at lab:7", "the cause that is known stays"
+    sink._finish()
+    assert sink.stats.error == "", "no value was to be sent"
+    assert [call[0] for call in library.called[-2:]] == ["disconnect", "loop_stop"]
+
+
+class Refusal:
+    """A reason code of the library, as it prints itself."""
+
+    is_failure = True
+
+    def __str__(self) -> str:
+        return "Not authorized"
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (socket.gaierror(-2, "x"), "unknown host lab"),
+        (ConnectionRefusedError(), "nothing is listening at lab:7"),
+        (TimeoutError(), "lab:7 does not answer"),
+        (ConnectionResetError(), "lab:7 closed the connection; it may not support TLS (mqtt://)"),
+        (OSError(113, "No route to host"), "lab:7 cannot be reached: No route to host"),
+        (ValueError("odd"), "lab:7 cannot be reached: odd"),
+        (Refusal(), "the broker at lab refused: not authorized"),
+    ],
+)
+def test_why_there_is_no_connection_is_said_in_words(error: Any, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, _ = with_library(monkeypatch, "mqtt://lab:7")
+    if isinstance(error, Refusal):
+        sink._on_connect(None, None, None, error, None)
+    else:
+        try:
+            raise error
+        except Exception:  # noqa: BLE001  where the library calls it
+            sink._on_connect_fail()
+    assert (sink.stats.state, sink.stats.detail) == ("waiting", words)
+    sink._count(dropped=1)
+    sink._finish()
+    assert sink.stats.error == f"mqtt://lab:7 accepted nothing: {words}."

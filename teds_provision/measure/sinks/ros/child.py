@@ -89,7 +89,7 @@ class ChildSink(TopicSink):
         self._stop(0.0)
         self._numbers, self._named = {}, {}
         self._announced = False
-        self._complaint = ""
+        self._heard = self._complaint = ""
         self._ready.clear()
         with every_core():
             self._child = subprocess.Popen(
