@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.measure.blocks import ChannelFacts
@@ -33,6 +33,7 @@ VARIANCE_NOTE = (
     "variance = deviation^2 where the profile knows a standard deviation, else (uncertainty / sqrt 3)^2: every error "
     "within the worst case equally likely"
 )
+_RATIOS = (Units(), Units(interpretation=1))  # a plain number, a ratio of equal units
 _KELVIN = units_of(kelvins=1)
 _STRESS = units_of(meters=-1, kilograms=1, seconds=-2)
 _LUX = units_of(meters=-2, candelas=1, steradians=1)
@@ -64,7 +65,7 @@ def meaning_of(facts: ChannelFacts) -> Meaning:
     if facts.kind == "actuator":
         return NUMBER
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
-    if "relative humidity" in words and facts.units is not None and replace(facts.units, interpretation=0) == Units():
+    if "relative humidity" in words and facts.units in _RATIOS:
         return HUMIDITY
     if facts.units == _STRESS and {"stress", "modulus", "strength"} & set(words.split()):
         return NUMBER

@@ -34,7 +34,15 @@ from teds_provision.measure.sinks.base import LIVE_WAITING, ROWS
 from teds_provision.measure.sinks.joints import joints_of, state_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.names import Topics, slug
-from teds_provision.measure.sinks.vectors import FieldValue, Meaning, compounds_of, is_range, meaning_of, variance_of
+from teds_provision.measure.sinks.vectors import (
+    VARIANCE_NOTE,
+    FieldValue,
+    Meaning,
+    compounds_of,
+    is_range,
+    meaning_of,
+    variance_of,
+)
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 from teds_provision.teds.calibration.plain import calibration_from_json
@@ -154,6 +162,26 @@ def test_a_stranger_takes_no_name_of_a_node_that_is_known() -> None:
     assert topics.node(HAND) != "arm"
 
 
+@pytest.mark.parametrize(
+    ("name", "topic"),
+    [(name, f"{name}_1") for name in ("array", "teds", "state", "status", "age", "cmd")]
+    + [(name, f"{name}_ch1") for name in ("stream", "imu", "magnetic_field", "wrench")]
+    + [(name, f"{name}_1") for name in ("stream_0", "imu_2", "magnetic_field_12", "wrench_4")]
+    + [(name, name) for name in ("stream_x", "imus", "teds_2", "range")],
+)
+def test_a_channel_with_a_reserved_name_gets_its_number(name: str, topic: str) -> None:
+    topics = Topics(STATION)
+    topics.learn([replace(ANGLE, name=name)])
+    assert topics.channel(ARM, 1) == f"/bench/arm/{topic}"
+
+
+def test_a_group_never_gets_the_topic_of_joints() -> None:
+    groups = ("hand", "", "Joint States", "joint_commands", "joints")
+    assert [Topics(STATION).of_group(group) for group in groups] == [
+        "/bench/hand", "/bench/all", "/bench/joint_states_group", "/bench/joint_commands_group", "/bench/joints",
+    ]  # fmt: skip
+
+
 def test_words_become_plain_letters() -> None:
     assert slug("Drehwinkel (Größe)") == "drehwinkel_grosse"
     assert slug("3. axis") == "n_3_axis"
@@ -172,6 +200,11 @@ def test_words_become_plain_letters() -> None:
         ("lx", "light", "", "sensor_msgs/Illuminance"),
         ("%", "relative_humidity", "", "sensor_msgs/RelativeHumidity"),
         ("%", "ch1", "relative-humidity", "sensor_msgs/RelativeHumidity"),
+        ("1", "relative humidity", "", "sensor_msgs/RelativeHumidity"),
+        ("dB", "relative humidity", "", "std_msgs/Float64"),
+        ("digital", "relative humidity, alarm", "", "std_msgs/Float64"),
+        ("arbitrary", "relative humidity", "", "std_msgs/Float64"),
+        ("%", "humidity", "", "std_msgs/Float64"),
         ("degC", "relative humidity, its sensor", "", "sensor_msgs/Temperature"),
         ("%", "throttle", "", "std_msgs/Float64"),
         ("m", "height", "", "std_msgs/Float64"),
@@ -208,6 +241,7 @@ def test_a_vector_group_is_one_message_if_its_unit_tells_what_it_is() -> None:
 
     assert kinds(*axes("T", 1)) == [("sensor_msgs/MagneticField", "magnetic_field")]
     assert kinds(*axes("m/s^2", 1)) == [("sensor_msgs/Imu", "imu")]
+    assert kinds(*axes("rad/s", 1)) == [("sensor_msgs/Imu", "imu")]
     assert kinds(*axes("m/s^2", 1), *axes("rad/s", 4)) == [("sensor_msgs/Imu", "imu")]
     assert kinds(*axes("m/s^2", 1), *axes("m/s^2", 4)) == [("sensor_msgs/Imu", "imu_1"), ("sensor_msgs/Imu", "imu_4")]
     assert kinds(*axes("N", 1), *axes("N m", 4)) == [("geometry_msgs/WrenchStamped", "wrench")]
@@ -217,6 +251,8 @@ def test_a_vector_group_is_one_message_if_its_unit_tells_what_it_is() -> None:
     assert kinds(*(replace(facts, vector=()) for facts in axes("T", 1))) == [], "nobody said that they are one vector"
     assert kinds(*axes("T", 1)[:2], *axes("m/s^2", 1)[2:]) == [], "axes of two units"
     assert kinds(*axes("m/s^2", 1, kind="actuator")) == []
+    four = axes("T", 1) + axes("T", 4)[:1]
+    assert kinds(*(replace(facts, vector=(1, 2, 3, 4)) for facts in four)) == [], "four members are no x, y, z"
 
 
 def test_half_a_vector_is_none() -> None:
@@ -231,6 +267,9 @@ def test_half_a_vector_is_none() -> None:
 def test_a_range_finder_is_one_by_name_and_has_no_plain_number_beside() -> None:
     facts = ChannelFacts(ARM, "arm", 1, "range finder", units=parse_units("m"), low=0.5, high=8.0)
     assert is_range(facts)
+    assert [is_range(replace(facts, name=name)) for name in ("Rangefinder", "distance_sensor", "Range-Finder 2")] == [
+        True
+    ] * 3
     assert not is_range(replace(facts, name="height"))
     assert is_range(replace(facts, name="height", quantity="range_finder")), "its profile calls it so"
     assert not is_range(replace(facts, kind="actuator"))
@@ -506,6 +545,25 @@ def test_metadata_and_parameters_say_what_the_datasheet_says() -> None:
     assert words["channels"][0]["topic"] == "/bench/arm/angle"
     assert words["channels"][0]["fingerprint"] == "ab" * 32
     assert sink.parameters["/bench/arm/angle"] == {k: v for k, v in words["channels"][0].items() if k != "topic"}
+
+
+def test_the_metadata_of_a_node_are_held_whole() -> None:
+    """What is not known is left out; the frame has the node's name in it."""
+    bare = ChannelFacts(ARM, "arm", 2, "", frame="{node}_base")
+    sink = carried([], facts=[bare], station=replace(STATION, test_pattern=True))
+    assert json.loads(sink.words["/bench/arm/teds"]) == {
+        "uuid": ARM,
+        "station": "bench",
+        "clock": STATION.clock,
+        "test_pattern": True,
+        "variance": VARIANCE_NOTE,
+        "channels": [
+            {
+                "uuid": ARM, "node": "arm", "number": 2, "kind": "sensor", "frame": "arm_base",
+                "topic": "/bench/arm/ch2",
+            }
+        ],
+    }  # fmt: skip
 
 
 def test_only_actuators_listen_and_only_if_commands_are_accepted() -> None:
