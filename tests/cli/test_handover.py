@@ -15,6 +15,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
+from teds_provision.cli.station import handover
+from teds_provision.handover.incoming import NodeProof, NodeProofFailure
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, payload_of, seal_bundle
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
@@ -123,6 +125,50 @@ def test_a_move_and_its_receipt_lost_and_found(homes: Homes) -> None:
         assert homes.run(homes.north, "handover", "receipt", receipt).json["fresh"] is fresh
     (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
     assert row["state"] == "closed"
+
+
+def test_a_folder_of_receipts_completes_every_move_and_names_what_is_none(homes: Homes) -> None:
+    folder = homes.folder / "receipts"
+    folder.mkdir()
+    for name, uuid in zip("ac", UUIDS, strict=True):
+        path = homes.export(uuid, "--mode", "move", name=f"{name}.jwe")
+        taken = homes.run(homes.south, "import-keys", path, "--yes", "--receipt", folder / f"{name}.receipt")
+        assert taken.code == 0
+    (folder / "b.receipt").write_text("none")
+    (folder / "d.receipt.old").write_text("none")
+    done = homes.run(homes.north, "handover", "receipt", folder)
+    assert done.code == 8
+    assert done.json["error"]["code"] == "bad-data"
+    assert [closed["imported"] for closed in done.json["receipts"]] == [[uuid] for uuid in UUIDS]
+    assert {row["state"] for row in homes.run(homes.north, "handover", "list").json["handovers"]} == {"closed"}
+    homes.refused(3, "handover", "receipt", homes.folder / "north" / "batches", home=homes.north)
+    (folder / "b.receipt").unlink()
+    again = homes.run(homes.north, "handover", "receipt", folder)
+    assert (again.code, [closed["fresh"] for closed in again.json["receipts"]]) == (0, [False, False])
+
+
+@pytest.mark.parametrize(
+    ("words", "contacted", "code"),
+    [
+        ((), 0, 0),
+        (("--prove",), 1, 5),  # one of the two was not reached
+        (("--can", "udp_multicast:239.74.163.2"), 1, 0),
+        (("--can", "udp_multicast:239.74.163.2", "--no-prove"), 0, 0),
+    ],
+)
+def test_each_node_of_a_bundle_is_contacted_if_a_link_is_named_and_only_prove_needs_them_all(
+    homes: Homes, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], contacted: int, code: int
+) -> None:
+    asked: list[list[str]] = []
+
+    def prove_nodes(_station: Any, _links: Any, uuids: Any, _reporter: Any, *, hold: Any) -> list[Any]:
+        asked.append([uuid.hex() for uuid in uuids])
+        return [NodeProof(uuids[0], 1, rotated=False), NodeProofFailure(uuids[1], "No node answered.")]
+
+    monkeypatch.setattr(handover, "prove_nodes", prove_nodes)
+    done = homes.run(homes.south, "import-keys", homes.export("--all"), "--yes", *words)
+    assert (done.code, asked) == (code, [UUIDS] * contacted)
+    assert done.json["not_proven"] == ({UUIDS[1]: "No node answered."} if contacted else {})
 
 
 def test_the_plan_of_a_receipt_whose_move_was_undone_is_refused_and_leaves_no_entry(homes: Homes) -> None:

@@ -33,14 +33,14 @@ from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, s
 from teds_provision.protocol.handover.jose import verify_compact
 from teds_provision.protocol.handover.receipt import TYPE, open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import seal_revocation
-from teds_provision.protocol.keys import station_key_message
+from teds_provision.protocol.keys import fingerprint, station_key_message
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.sign import known_node_keys, sign
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import Handover, NodeRecord
+from teds_provision.station.store.records import Handover, NodeRecord, TrustRecord
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session, trust
 
@@ -315,6 +315,19 @@ def test_the_owners_ca_stays_though_a_station_that_is_trusted_no_more_brought_no
     (south,) = pair.north.policy.trusted("station")
     assert remove(pair.north, south).cas == ()
     assert pair.north.policy.counts(pair.north.ca)
+
+
+def test_a_ca_that_a_person_named_stays_though_the_station_that_brought_it_is_trusted_no_more(pair: Pair) -> None:
+    pair.take(pair.export("copy")[0])
+    (north,) = pair.south.policy.trusted("station")
+    assert plan_removal(pair.south, north).cas == (pair.north.ca,)
+    named = TrustRecord("the owner", "ca", pair.north.ca, fingerprint(pair.north.ca))
+    pair.south.policy.trust(named)
+    pair.south.keys.set_ca_of(bytes(10), pair.north.ca)
+    assert remove(pair.south, north).cas == ()
+    assert pair.south.policy.counts(pair.north.ca)
+    removal = plan_removal(pair.south, named)
+    assert (removal.cas, removal.under, removal.shared, removal.bans) == ((pair.north.ca,), 2, (), ())
 
 
 def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, west: Station) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import BadDataError, NotFoundError
+from teds_provision.handover import life
 from teds_provision.handover.deny import deny, lift
 from teds_provision.handover.life import (
     TakeoverPlan,
@@ -25,6 +26,7 @@ from teds_provision.handover.life import (
 from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.provisioning.agree import ResetReceipt
+from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft, KeyRecord, NodeRecord, WhitelistEntry
 from teds_provision.teds.image import Image
@@ -220,3 +222,25 @@ def test_a_calibration_that_cannot_be_built_in(station: Station) -> None:
     station.nodes.remember(OLD, profile="p")
     plan = plan_takeover(station, OLD, NEW, copy_calibration=True)
     assert plan.calibration == {(1, 3): b"channel", (1, 5): b"calibration"}
+    every = {(number, code): b"octets" for number in (0, 1, 2, 3) for code in (1, 3, 4, 5, 12, 16, 128)}
+    del every[3, 5], every[2, 3]
+    station.datasheets.keep_datasheet(Image(OLD, every))
+    plan = plan_takeover(station, OLD, NEW, copy_calibration=True)
+    assert sorted(plan.calibration) == [(1, 3), (1, 5), (2, 5)], "of every channel, and nothing of another kind"
+
+
+@pytest.mark.parametrize(("count", "more"), [(1, "rad. Nothing"), (2, r"rad \(and 1 more\). Nothing")])
+def test_a_spare_of_another_type_is_refused_by_its_last_reading(
+    station: Station, monkeypatch: pytest.MonkeyPatch, count: int, more: str
+) -> None:
+    station.pins.put(WhitelistEntry(NEW))
+    station.nodes.put(NodeRecord(OLD, NODE.point))
+    monkeypatch.setattr(
+        life, "differences", lambda *_: ("Channel 1 is in N, not in rad.", "Channel 2 is no sensor.")[:count]
+    )
+    plan_takeover(station, OLD, NEW, copy_calibration=False)
+    station.datasheets.keep_datasheet(Image(OLD, {(1, 3): b"channel"}))
+    plan_takeover(station, OLD, NEW, copy_calibration=False)
+    station.datasheets.keep_datasheet(Image(NEW, {(1, 3): b"channel"}))
+    with pytest.raises(WrongBoardError, match=f"Channel 1 is in N, not in {more} was changed"):
+        plan_takeover(station, OLD, NEW, copy_calibration=False)

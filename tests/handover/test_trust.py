@@ -12,8 +12,18 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
-from teds_provision.handover.trust import add, candidate, candidates_of, find_trusted, private_keys, remove, spoken
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
+from teds_provision.handover.trust import (
+    Certificate,
+    add,
+    candidate,
+    candidates_of,
+    find_trusted,
+    private_keys,
+    remove,
+    spoken,
+    write_certificate,
+)
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.station.station import Station
 from tests.bench import make_station
 
@@ -138,6 +148,37 @@ def test_a_folder_of_keys_with_roles_by_name(north: Station, keys: Path) -> None
     assert SoftwareKey(22).point in north.policy.trusted_cas()
 
 
+@pytest.mark.parametrize("kind", ["rsa", "p384"])
+@pytest.mark.parametrize("name", ["a.pem", "zz.pem", "nested/key.pub", "zz.ca.pem"])
+def test_a_folder_with_a_key_of_another_kind_is_refused_whole(north: Station, keys: Path, name: str, kind: str) -> None:
+    (keys / "lab.pem").write_text(to_pem(OTHER.point))
+    (keys / name).parent.mkdir(exist_ok=True)
+    made = rsa.generate_private_key(65537, 1024) if kind == "rsa" else ec.generate_private_key(ec.SECP384R1())
+    (keys / name).write_text(public(made))
+    with pytest.raises(BadDataError, match="not a P-256 key"):
+        candidates_of(north, keys, "station")
+
+
+def test_which_files_of_a_folder_are_keys_and_of_whom(north: Station, keys: Path) -> None:
+    owner, east = SoftwareKey(23), SoftwareKey(24)
+    certificate = Certificate("the east", east.point, owner.point, owner.sign(station_key_message(east.point)))
+    (keys / "east.cert").write_bytes(write_certificate(certificate))
+    for name, number in (
+        ("lab.pub", 25), ("own.ca.pub", 26), ("more.ca.pem", 27), (".hidden.pem", 28), ("notes.txt", 29)
+    ):  # fmt: skip
+        (keys / name).write_text(to_pem(SoftwareKey(number).point))
+    (keys / "folder.pem").mkdir()
+    found = candidates_of(north, keys, "station")
+    assert [(one.record.name, one.record.role, one.record.point, one.certificate) for one in found] == [
+        ("east", "station", east.point, certificate),
+        ("lab", "station", SoftwareKey(25).point, None),
+        ("more", "ca", SoftwareKey(27).point, None),
+        ("own", "ca", SoftwareKey(26).point, None),
+    ]
+    add(north, found[:1])
+    assert north.identity.certificate(owner.point, east.point) == certificate.signature
+
+
 def bad_files() -> dict[str, bytes]:
     key = ec.generate_private_key(ec.SECP256R1())
     return {
@@ -195,8 +236,6 @@ def test_an_empty_or_missing_folder(north: Station, keys: Path) -> None:
 
 
 def test_a_certificate_that_does_not_verify(north: Station, keys: Path) -> None:
-    from teds_provision.handover.trust import Certificate, write_certificate
-
     forged = Certificate("lab", OTHER.point, north.ca, OTHER.sign(b"something else"))
     (keys / "lab.cert").write_bytes(write_certificate(forged))
     with pytest.raises(NotAuthenticError):

@@ -26,6 +26,7 @@ from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import PreparedOrder
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.plant.line import EvidenceRow, UnitRow
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
@@ -300,6 +301,30 @@ def test_a_job_that_wants_no_evidence_gets_none_of_a_failure_either(owner: Stati
     silent = cast("Conversation", None)
     allotted(run).failed(silent, board(), (), "agree", NotFoundError("x"))
     assert list(owner.plant.line.evidence()) == []
+
+
+@pytest.mark.parametrize("result", ["passed", "failed"])
+@pytest.mark.parametrize("evidence", [True, False])
+def test_a_board_of_a_job_counts_and_gets_its_label_if_it_passed_with_evidence_or_without(
+    owner: Station, monkeypatch: pytest.MonkeyPatch, evidence: bool, result: Any
+) -> None:
+    run = LineRun(owner, job(owner, evidence=evidence))
+    unit, labels, kept = allotted(run), list[bytes](), list[object]()
+    monkeypatch.setattr(run, "passed_board", labels.append)
+    monkeypatch.setattr(unit, "_keep", lambda _node, _uuid, _teds, steps, _image: kept.append(steps))
+    verified = Verification(A, (Check("signed", result, "why"),))
+    step = SimpleNamespace(name="write", result="done", seconds=0.5)
+    done: Any = SimpleNamespace(
+        who=SimpleNamespace(uuid=A), verified=verified, steps=(step,), image=SimpleNamespace(security=b"teds")
+    )
+    unit.ended(cast("Conversation", None), done)
+    passed = result == "passed"
+    assert labels == ([A] if passed else [])
+    if evidence:
+        steps = (("write", "done", 500),)
+        assert kept == [steps if passed else (*steps, ("verdict", "not-authentic", 0))]
+    else:
+        assert (kept, run.passed) == ([], int(passed))
 
 
 def test_a_station_asks_no_office_if_it_is_the_office_itself_or_the_job_has_none(owner: Station) -> None:
