@@ -1,7 +1,8 @@
 """One document to paste into a bug report: versions, links, checks, last errors, without what identifies a site.
 
 It holds no keys and no passphrases, as the checks and the audit log hold none. Fingerprints, the user's name, the
-host's name and the paths of home and working folder are replaced; UUIDs too, unless they are asked for.
+host's name, those of the plant and of stations, and the paths of home and working folder are replaced; UUIDs too,
+unless they are asked for.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class Mask:
         self._with_uuids = with_uuids
         self._uuids: dict[str, str] = {}
         private = {
+            **_names_of_stations(system),
             str(system.home.absolute()): "HOME",
             str(system.home): "HOME",
             str(system.workspace): "WORKSPACE",
@@ -62,6 +64,21 @@ class Mask:
 
     def _number(self, found: re.Match[str]) -> str:
         return self._uuids.setdefault(found[0].lower(), f"UUID-{len(self._uuids) + 1}")
+
+
+def _names_of_stations(system: System) -> dict[str, str]:
+    """Return a word for the name of this station, of each that it trusts, and of the plant and each of its stations."""
+    if not has_store(system.home):
+        return {}
+    try:
+        with Station.inspect(system.home) as station:
+            names = {record.name for record in station.policy.listed()} | {station.name}
+            roster = station.plant.roster
+    except TedsProvisionError:  # the checks report why
+        return {}
+    names |= {member.name for member in roster.by_key.values()} if roster is not None else set()
+    words = {name: f"STATION-{number}" for number, name in enumerate(sorted(names), 1)}
+    return words | ({roster.name: "PLANT"} if roster is not None else {})
 
 
 def _kind(link: str) -> str:

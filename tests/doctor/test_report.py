@@ -6,14 +6,19 @@ import getpass
 import json
 import shutil
 import socket
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from teds_provision.doctor.checks import System
+from teds_provision.doctor.checks import Finding, System
 from teds_provision.doctor.report import Mask, build_report
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.plant.roster import Member, RemovedMember
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import TrustRecord
 from tests.cli.shell import call
+from tests.plant.owner import ALL, alone, join, member, roster_of
 
 UUID = "8d4d9da65281f7000000"
 
@@ -111,3 +116,23 @@ def test_a_report_never_replaces_a_file(home: Path, tmp_path: Path) -> None:
 def test_a_machine_without_a_station_has_a_report_too(tmp_path: Path) -> None:
     report = json.loads(call(tmp_path / "none", "doctor", "--report", "-", passphrase=None).out)
     assert report["errors"] == []
+
+
+def test_names_of_the_plant_and_of_stations_are_gone(tmp_path: Path) -> None:
+    """The check of the registry names the plant, and whoever's clock is wrong."""
+    west, old = SoftwareKey(71), SoftwareKey(72)
+    with closing(alone(tmp_path / "home")) as station:
+        removed = RemovedMember("old mill", old.point, frozenset({"line"}), "retired", (0, ""))
+        members = (
+            member(station, "owner", *ALL),
+            Member("west", west.point, station.identity.certify(west.point), frozenset({"line"})),
+        )
+        join(station, roster_of(station, *members, version=2, previous="0" * 64, removed=(removed,), name="Mill (A)"))
+        station.policy.trust(TrustRecord("lab", "station", SoftwareKey(73).point, "73" * 32))
+    why = "Mill (A): roster 2 holds. west has dated its page; lab, owner and old mill have not. Westward."
+    finding = Finding("registry", "warning", why, "Set the clock of west.")
+    (shown,) = build_report(System(tmp_path / "home"), [finding], {}, with_uuids=True)["checks"]
+    assert (shown["why"], shown["fix"]) == (
+        "PLANT: roster 2 holds. STATION-4 has dated its page; STATION-1, STATION-3 and STATION-2 have not. Westward.",
+        "Set the clock of STATION-4.",
+    )

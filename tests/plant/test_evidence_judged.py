@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,9 +11,11 @@ import pytest
 
 from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.plant import verify_evidence
-from teds_provision.plant.verify_evidence import EvidenceTotals, JudgedEvidence, _wrong_members
-from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.plant.commands import line as commands
+from teds_provision.plant.verify_evidence import EvidenceAnchors, EvidenceTotals, JudgedEvidence, _wrong_members
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Role, Roster, Why
+from tests.cli.shell import call
 from tests.plant.plants import NOW, REGISTRY
 
 LINE, OFFICE, STRANGER = (SoftwareKey(number) for number in (81, 82, 83))
@@ -131,3 +135,39 @@ def test_totals_have_the_exit_code_of_the_worst() -> None:
             joined.join(one)
         assert (totals.exit_code, joined) == (code, totals)
     assert totals.to_json() == {"totals": {"files": 3, "not authentic": 1, "unreadable": 2}}
+
+
+@pytest.mark.parametrize(
+    ("found", "line"),
+    [
+        (judged(), f"passed         {'00' * 10}  f.json"),
+        (judged("failed"), f"failed         {'00' * 10}  f.json: the attempt ended with no-node"),
+        (judged("failed", "one", "two"), f"not authentic  {'00' * 10}  f.json: one; two"),
+        (judged(None, error=BadDataError("It is none.")), "unreadable     -                     f.json: It is none."),
+    ],
+)
+def test_one_file_as_a_line(found: JudgedEvidence, line: str) -> None:
+    if found.evidence is not None:
+        failure = "no-node" if found.evidence.verdict == "failed" else None
+        facts: Any = SimpleNamespace(failure=failure)
+        evidence: Any = SimpleNamespace(verdict=found.evidence.verdict, uuid=bytes(10), facts=facts)
+        found = replace(found, evidence=evidence)
+    assert commands._line(found) == line
+
+
+@pytest.mark.parametrize("roster", [True, False])
+@pytest.mark.parametrize("words", [(), ("--json",), ("--quiet",)])
+def test_who_verifies_without_a_roster_is_told_what_that_leaves_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], roster: bool
+) -> None:
+    file, ca = tmp_path / "a.json", tmp_path / "ca.pem"
+    file.write_text("{}")
+    ca.write_text(to_pem(LINE.point))
+    given: list[tuple[object, ...]] = []
+    monkeypatch.setattr(EvidenceAnchors, "from_files", lambda *anchors: given.append(anchors))
+    monkeypatch.setattr(verify_evidence, "verify_evidence", lambda *_: [(["a line"], EvidenceTotals(1, {"passed": 1}))])
+    more = ("--roster", file) if roster else ()
+    done = call(tmp_path, *words, "evidence", "verify", file, "--ca", ca, *more, passphrase=None)
+    assert (done.code, given) == (0, [(LINE.point, None, file if roster else None)])
+    note = "Without --roster, evidence from a stolen station counts as valid too.\n"
+    assert done.err == ("" if roster or words else note)

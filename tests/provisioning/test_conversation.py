@@ -350,6 +350,13 @@ def test_what_a_trace_gets_of_a_sealed_command_and_its_reply(board: Board) -> No
         node.request(IDENTIFY, "x")
     assert [(way, sealed) for way, _, sealed, _ in noted] == [("out", True), ("in", False)], "a refusal in plain"
     noted.clear()
+    link.script = [Reply(True, payload=bytes(24)).encode()]
+    with pytest.raises(SessionLostError):
+        node.request(IDENTIFY, "x")
+    assert [(way, sealed, opened) for way, _, sealed, opened in noted] == [
+        ("out", True, IDENTIFY.encode()), ("in", True, None)
+    ], "a reply with a wrong tag is sealed, and not opened"  # fmt: skip
+    noted.clear()
     node.forget()
     node.request(IDENTIFY, "x")
     assert [(way, sealed, opened) for way, _, sealed, opened in noted] == [("out", False, None), ("in", False, None)]

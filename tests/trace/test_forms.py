@@ -430,3 +430,24 @@ def test_four_octets_of_a_head_are_no_trace(tmp_path: Path) -> None:
     (tmp_path / "t").write_bytes(b"\x0a\x0d\x0d\x0a")
     with pytest.raises(BadDataError, match="is not a trace"):
         read_trace(tmp_path / "t")
+
+
+@pytest.mark.parametrize(
+    ("link", "identifier", "octets", "words"),
+    [
+        ("nfc", None, "3004", "READ from page 4"),
+        ("pcsc", None, "00b000000f", "READ BINARY"),
+        ("ble", None, "3004", ""),
+        ("can", 0x18DA21F1, "025507", "f1 to 21: single frame, transaction 85, 1 octets"),
+    ],
+)
+def test_each_frame_is_named_by_its_link(
+    tmp_path: Path, link: str, identifier: int | None, octets: str, words: str
+) -> None:
+    path = tmp_path / "t.trace"
+    trace = open_trace(path, print)
+    trace.frame(link, "out", bytes.fromhex(octets), identifier=identifier, fd=True)
+    (record,) = read_trace(path)  # written at once
+    trace.close()
+    assert (record.link, record.layer, record.direction, record.octets.hex()) == (link, "frame", "out", octets)
+    assert (record.command, record.identifier, record.fd) == (words, identifier, identifier is not None)
