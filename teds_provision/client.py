@@ -30,6 +30,8 @@ from teds_provision.shapes.measurement import MeasurementMembers
 from teds_provision.shapes.problem import problem_in
 
 if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
     from teds_provision.api.answers import (
         Applied,
         Entry,
@@ -90,6 +92,19 @@ def _is_over(connection: http.client.HTTPConnection) -> bool:
     with selectors.DefaultSelector() as selector:
         selector.register(connection.sock, selectors.EVENT_READ)
         return bool(selector.select(0))
+
+
+def _address_of(url: str) -> tuple[str, str, int]:
+    """Return scheme, host and port of a base station; raises UsageError."""
+    with suppress(ValueError):  # a port or an IPv6 address that is none
+        parts = urlsplit(url)
+        if parts.scheme in ("http", "https") and parts.hostname:
+            # without a port, http.client would take the last digits of an IPv6 address for it
+            usual = 443 if parts.scheme == "https" else 80
+            return parts.scheme, parts.hostname, usual if parts.port is None else parts.port
+    raise UsageError(
+        f"{url!r} is not the address of a base station.", hint="Use an address such as http://127.0.0.1:8351."
+    )
 
 
 def default_home() -> Path:
@@ -160,7 +175,7 @@ class Client:
             raise LinkError("The base station's answer is not valid JSON.") from error
         if status < 400:
             return value
-        raise ApiError(status, **problem_in(value, otherwise=f"The base station answered {status}."))
+        raise _refusal(status, value)
 
     def _ask(
         self, method: str, path: str, body: str | bytes | None, if_match: str | None = None
@@ -179,10 +194,8 @@ class Client:
         except (OSError, http.client.HTTPException) as error:
             self.close()
             if not again:
-                raise LinkError(
-                    f"The base station is not responding: {error}.", hint="Is it running? teds-provision ncap status"
-                ) from error
-        return self._exchange(method, path, body, headers)
+                raise _no_answer(error) from error
+        return self._ask(method, path, body, if_match)  # once: there is no kept connection now
 
     def _exchange(
         self, method: str, path: str, body: str | bytes | None, headers: dict[str, str]
@@ -200,16 +213,11 @@ class Client:
     def _open(self) -> http.client.HTTPConnection:
         if self.url is None:
             return _UnixConnection(self._home / SOCKET, self._timeout)
-        parts = urlsplit(self.url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise UsageError(
-                f"{self.url!r} is not the address of a base station.",
-                hint="Use an address such as http://127.0.0.1:8351.",
-            )
-        if parts.scheme == "https":
+        scheme, host, port = _address_of(self.url)
+        if scheme == "https":
             context = ssl.create_default_context()
-            return http.client.HTTPSConnection(parts.hostname, parts.port, timeout=self._timeout, context=context)
-        return http.client.HTTPConnection(parts.hostname, parts.port, timeout=self._timeout)
+            return http.client.HTTPSConnection(host, port, timeout=self._timeout, context=context)
+        return http.client.HTTPConnection(host, port, timeout=self._timeout)
 
     # -- resources ---------------------------------------------------------------------------------------------------
 
@@ -470,23 +478,45 @@ class Client:
             connection.close()
 
     def live(self) -> Iterator[dict[str, Any]]:
-        """Yield live messages: ``hello``, then values, events and beats, until the connection ends.
+        """Yield live messages: ``hello``, then values, events and beats, until the connection ends, however it ends.
 
-        Needs the package websockets (the extra ``ncap``).
+        Needs the package websockets (the extra ``ncap``). Raises ApiError, LinkError.
         """
+        from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+
+        try:
+            opened = self._open_live()
+        except InvalidStatus as refused:
+            raise _refusal(refused.response.status_code, refused.response.body) from refused
+        except (OSError, InvalidHandshake) as error:
+            raise _no_answer(error) from error
+        with opened as connection, suppress(ConnectionClosed):
+            for text in connection:
+                yield json.loads(text)
+
+    def _open_live(self) -> ClientConnection:
         from websockets.sync.client import connect as connect_socket
         from websockets.sync.client import unix_connect
 
         if self.url is None:
             with short_path(self._home / SOCKET) as path:
-                opened = unix_connect(path, f"ws://localhost{API}/live", compression=None)
-        else:
-            headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
-            url = self.url.replace("http", "ws", 1).rstrip("/")
-            opened = connect_socket(f"{url}{API}/live", additional_headers=headers, compression=None)
-        with opened as connection:
-            for text in connection:
-                yield json.loads(text)
+                return unix_connect(path, f"ws://localhost{API}/live", compression=None)
+        headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
+        url = self.url.replace("http", "ws", 1).rstrip("/")
+        # as the other requests: a proxy of the environment would get the token
+        return connect_socket(f"{url}{API}/live", additional_headers=headers, compression=None, proxy=None)
+
+
+def _refusal(status: int, body: object) -> ApiError:
+    """Return the error for an answer that refuses; ``body`` is its JSON, or its octets."""
+    if isinstance(body, bytes):
+        with suppress(ValueError):
+            body = json.loads(body)
+    return ApiError(status, **problem_in(body, otherwise=f"The base station answered {status}."))
+
+
+def _no_answer(error: Exception) -> LinkError:
+    return LinkError(f"The base station is not responding: {error}.", hint="Is it running? teds-provision ncap status")
 
 
 class _UnixConnection(http.client.HTTPConnection):

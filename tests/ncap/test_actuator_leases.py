@@ -462,3 +462,72 @@ def test_who_lets_go_is_answered_when_the_node_has_answered() -> None:
     )
     assert leases.release_actuator("ab", 1) == {"applied": {"value": 0.5}, "until": None, "safe": True}
     assert course == ["it is to be let go"]
+
+
+@pytest.mark.parametrize(
+    ("pause", "left", "seconds"), [(0.25, 9.0, 0.25), (0.25, 0.125, 0.125), (0.25, 0.0, 0.0), (0.25, -5.0, 0.0)]
+)
+def test_a_value_is_sent_again_after_its_pause_and_not_after_its_time(
+    pause: float, left: float, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[float] = []
+
+    class News(NewsOfTheEnd):
+        def wait_for(self, over: Callable[[], bool], seconds: float) -> bool:
+            waited.append(seconds)
+            assert not over()
+            held.order = _SetPointOrder(0.75, None, 2)
+            assert over(), "another value"
+            held.order, held.let_go = _SetPointOrder(0.5, None, 1), True
+            return over()
+
+    monkeypatch.setattr(actuator_leases, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    news = cast(Any, News([]))
+    held = _HeldActuator("ab", 1, 100.0 + left, _SetPointOrder(0.5, None, 1), news=news)
+    ActuatorLeases._until_news(held, 1, pause)
+    assert waited == [seconds]
+
+
+@pytest.mark.parametrize(("safe", "state"), [(False, "held"), (True, "released"), (None, "released")])
+def test_only_an_actuator_that_is_known_to_move_is_shown_as_held(safe: bool | None, state: str) -> None:
+    """None: the node did not say whether it is safe; nothing of this station holds it any more."""
+    sent: list[Any] = []
+    live = SimpleNamespace(event=lambda kind, **facts: sent.append((kind, facts)))
+    leases = leases_of(cast(Any, live))
+    applied = {"channel": 1, "value": 50.0, "unit": "mm", "raw": 1861}
+    held = _HeldActuator("ab", 1, 0.0, _SetPointOrder(0.5, None, 1), applied=applied)
+    leases._publish_state(held, safe=safe)
+    facts = {"value": 50.0, "unit": "mm", "safe": safe}
+    assert sent == [("actuator", {"uuid": "ab", "state": state, "channel": 1, **facts})]
+    assert leases.state("ab", 1) == facts
+    assert leases.state("ab", 2) is None
+
+
+def test_a_session_that_a_measurement_opens_is_waited_for_five_seconds_or_until_it_is_let_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, there, looks = [100.0], [100.0], list[float]()
+
+    class News(NewsOfTheEnd):
+        def wait_for(self, over: Callable[[], bool], seconds: float) -> bool:
+            assert not over()
+            looks.append(seconds)
+            now[0] += 1.0
+            return False
+
+    @contextmanager
+    def session(_uuid: str) -> Iterator[VerifiedSession | None]:
+        yield cast(Any, object()) if now[0] >= there[0] else None
+
+    monkeypatch.setattr(actuator_leases, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    for at, count in ((100.0, 0), (102.0, 2), (999.0, 5)):
+        now[0], there[0] = 100.0, at
+        looks.clear()
+        held = _HeldActuator("ab", 1, 0.0, _SetPointOrder(0.5, None, 1), news=cast(Any, News([])))
+        ActuatorLeases._until_there(held, session)
+        assert looks == [0.05] * count
+    held.let_go = True
+    now[0] = 100.0
+    looks.clear()
+    ActuatorLeases._until_there(held, session)
+    assert looks == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import time
 from contextlib import nullcontext
@@ -26,6 +27,7 @@ from teds_provision.ncap.web.guard import (
     front,
 )
 from teds_provision.ncap.web.tokens import Tokens, digest_of
+from teds_provision.station.store.audit import ACTOR, acting_for
 
 PORT = 8451
 HERE = f"127.0.0.1:{PORT}"
@@ -386,3 +388,124 @@ def test_tokens_of_another_process_are_read_as_soon_as_their_file_is_another_or_
     with pytest.raises(StoreError) as unreadable:
         tokens.find(first)
     assert unreadable.value.hint == "Remove the file and create new tokens: ncap token add NAME"
+
+
+def answer_of(guard: Guard, **scope: Any) -> tuple[int, dict[str, str], str]:
+    """Return status, headers and text of the answer to one request."""
+    sent: list[Message] = []
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    none: Any = None
+    given = {"type": "http", "method": "GET", "path": "/", "query_string": b"", **scope}
+    given["headers"] = [(name.encode(), value.encode()) for name, value in scope.get("headers", {}).items()]
+    asyncio.run(guard(given, none, send))
+    headers = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
+    return int(sent[0]["status"]), headers, b"".join(message.get("body", b"") for message in sent[1:]).decode()
+
+
+def test_who_came_by_the_users_own_socket_is_nobody_else_in_the_log(tmp_path: Path) -> None:
+    """The audit log has the user there; ``socket`` is no name of anybody, and a token may have it."""
+    actors: list[tuple[str | None, str]] = []
+
+    async def page(scope: Scope, _receive: Receive, send: Send) -> None:
+        actors.append((ACTOR.get(), scope["teds.caller"].owner))
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    tokens = Tokens(tmp_path)
+    with acting_for("token plotter"):
+        assert status_of(Guard(page, tokens, None), {}) == 200
+    script = {"host": HERE, "authorization": f"Bearer {tokens.add('socket')}"}
+    assert status_of(Guard(page, tokens, front((), PORT, tls=False)), script) == 200
+    assert actors == [(None, "ncap"), ("token socket", "api:socket")]
+
+
+@pytest.mark.parametrize(("slowed", "waits"), [(49, True), (50, False)])
+def test_at_most_fifty_requests_are_slowed_down_at_once(
+    tmp_path: Path, slowed: int, waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fifty-first is refused without a wait: each that waits has one of the places that all share."""
+    guard = Guard(app, Tokens(tmp_path), front((), PORT, tls=False))
+    guard._wrong.extend([time.monotonic()] * 10)
+    guard._slowed = slowed
+    slept: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    monkeypatch.setattr("teds_provision.ncap.web.guard.asyncio.sleep", sleep)
+    assert status_of(guard, {"host": HERE, "authorization": "Bearer nonsense"}) == 429
+    assert (slept, guard._slowed) == ([1.0] if waits else [], slowed)
+
+
+def test_the_login_address_is_asked_for_and_never_posted_to(tmp_path: Path) -> None:
+    tokens = Tokens(tmp_path)
+    guard, link = Guard(app, tokens, front((), PORT, tls=False)), tokens.login_link()
+    words = {"path": "/login", "query_string": f"token={link}".encode(), "headers": {"host": HERE}}
+    for method in ("POST", "HEAD", "PUT"):
+        status, _, text = answer_of(guard, method=method, **words)
+        assert (status, json.loads(text)["error"]) == (
+            405, {"code": "usage", "message": "The login address takes GET requests only.", "hint": ""},
+        )  # fmt: skip
+    assert answer_of(guard, **words)[0] == 303, "the link was not used up"
+    assert answer_of(guard, path="/login", headers={"host": HERE})[0] == 401
+    assert answer_of(guard, path="/login", headers={"host": "evil.example"})[0] == 421
+
+
+def test_a_body_that_is_too_long_ends_its_connection_and_no_other_refusal_does(tmp_path: Path) -> None:
+    """The rest of the body would be read as the next request."""
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    good = {"host": HERE, "authorization": f"Bearer {tokens.add('script')}"}
+    long = {**good, "content-length": str(MEBI + 1), "content-type": "application/json"}
+    status, headers, text = answer_of(guard, method="PUT", headers=long)
+    assert (status, headers["connection"], headers["content-type"]) == (413, "close", "application/json")
+    assert json.loads(text)["error"]["message"] == "The request body may have at most 1048576 octets."
+    assert headers["content-length"] == str(len(text))
+    for refused in ({"host": HERE}, {**good, "host": "evil.example"}):
+        assert "connection" not in answer_of(guard, headers=refused)[1]
+    both = {**good, "content-length": "4", "transfer-encoding": "chunked"}
+    status, headers, _ = answer_of(guard, method="PUT", headers=both)
+    assert (status, headers["connection"]) == (400, "close")
+
+
+def test_a_browsers_address_line_is_refused_by_a_page_and_a_script_by_json(tmp_path: Path) -> None:
+    guard = Guard(app, Tokens(tmp_path), front((), PORT, tls=False))
+    html = {"host": HERE, "accept": "text/html,*/*"}
+    for scope, page in (
+        ({"headers": html}, True),
+        ({"headers": {"host": HERE}}, False),
+        ({"headers": html, "method": "POST"}, False),
+        ({"headers": html, "type": "websocket"}, False),
+    ):
+        status, headers, text = answer_of(guard, **scope)
+        assert (status, headers["content-type"]) == (401, "text/html; charset=utf-8" if page else "application/json")
+        assert text.startswith("<!doctype html>" if page else '{"error": {"code": "no-token"'), text
+        assert "teds-provision ncap open" in text
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_tokens_that_cannot_be_read_are_reported_without_their_folder(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tokens = Tokens(tmp_path)
+
+    def find(_token: str) -> None:
+        raise StoreError("/home/me/ncap-tokens.json cannot be read.", hint="Look at /home/me/ncap-tokens.json.")
+
+    monkeypatch.setattr(tokens, "find", find)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    status, _, text = answer_of(guard, type=kind, headers={"host": HERE, "authorization": "Bearer x"})
+    error = {"code": "store", "message": "ncap-tokens.json cannot be read.", "hint": "Look at ncap-tokens.json."}
+    assert (status, json.loads(text)["error"]) == (503, error)
+
+
+def test_a_cookie_header_that_comes_twice_is_one(tmp_path: Path) -> None:
+    """RFC 9113, section 8.2.3: a proxy may split it."""
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    mine = f"ncap-{PORT}={tokens.login(tokens.login_link())}"
+    for first, second in (("a=1", mine), (mine, "a=1")):
+        assert status_of(guard, {"host": HERE, "cookie": first}, more=("Cookie", second)) == 200
+    assert status_of(guard, {"host": HERE, "cookie": "a=1; ncap-8452=x"}) == 401, "another service's"

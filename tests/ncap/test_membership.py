@@ -275,3 +275,84 @@ def test_a_new_node_may_be_slowed_to_a_fiftieth_and_the_messages_of_all_count(
     membership.members[A].load = NodeLoad(0.2, 3, 50.0)
     membership.members[B].load = NodeLoad(bus, 5, 50.0)
     assert membership.why_no_room(B, room, budget) == why
+
+
+def test_a_node_that_has_not_joined_yet_is_locked_and_neither_in_nor_leaving() -> None:
+    membership = joined(C)
+    membership.busy[A] = 99.0
+    membership.elsewhere = {A, B}
+    membership.arrive(A, 1.0)
+    assert (membership.busy, membership.elsewhere) == ({}, {B})
+    assert membership.begin_joining() == [A]
+    assert membership.members[A].locked, "its lock was taken when it arrived"
+    assert (membership.joined, membership.has(A)) == ((C,), False)
+    member = membership.begin_leaving(A)
+    assert member is not None
+    assert (member.joined, membership.leaving, membership.joined) == (False, set(), (C,))
+    assert (membership.begin_leaving(B), membership.leaving) == (None, set())
+    membership.begin_leaving(C)
+    assert membership.leaving == {C}
+
+
+def test_a_node_that_is_there_or_on_its_way_does_not_come_again() -> None:
+    membership = joined(A)
+    membership.arrive(B, 1.0)
+    assert [membership.may_come(uuid, says_factory=False) for uuid in (A, B, C)] == [False, False, True]
+    assert membership.may_come(C, says_factory=True), "only one that was refused is left to the adopter"
+
+
+def test_a_node_that_is_in_is_neither_lost_nor_waiting() -> None:
+    membership, last = joined(A), place()
+    released(membership, A)
+    membership.end(A, 0.0, LinkError("silent"), last=last, seen=None, room=0.0)
+    membership.wait(A, 30.0, None)
+    membership.arrive(A, 1.0)
+    membership.begin_joining()
+    membership.join(A)
+    assert (membership.lost, membership.waits) == ({}, {})
+
+
+def test_a_node_that_was_refused_is_not_tried_before_its_time_whatever_room_there_is() -> None:
+    membership = Membership(0.0)
+    membership.wait(A, 30.0, None)
+    membership.wait(B, 30.0, 0.25)
+    assert membership.due(29.99, lambda uuid: 9.0 if uuid == A else 0.25) == []
+    assert membership.due(30.0, lambda _uuid: 0.0) == [A, B]
+
+
+@pytest.mark.parametrize(
+    ("error", "there"),
+    [(LinkError("silent"), False), (PolicyError("banned"), False), (None, False), (None, True)],
+)
+def test_a_node_that_never_had_a_place_or_ended_in_order_is_not_asked(
+    error: TedsProvisionError | None, there: bool
+) -> None:
+    membership = joined(A)
+    released(membership, A)
+    membership.places[A] = before = place(NodeState.FACTORY)
+    last, seen = (place(), place()) if there else (None, None)
+    assert membership.end(A, 0.0, error, last=last, seen=seen, room=0.0) is AfterEnd.NOTHING
+    assert membership.places[A] is (last or before)
+    assert membership.lost == {}
+
+
+@pytest.mark.parametrize(
+    ("members", "began", "came", "now", "gathered"),
+    [
+        ((), 1000.0, [1002.99], 1002.9999, False),
+        ((), 1000.0, [1002.99], 1003.0, True),
+        ((), 1000.0, [1003.0], 1003.2, False),
+        ((), 1000.0, [1003.0, 1003.2], 1003.31, True),
+        ((C,), -1000.0, [0.0], 0.04, False),
+        ((C,), -1000.0, [0.0], 0.05, True),
+        ((C,), 1000.0, [1000.5 + 0.04 * number for number in range(8)], 1000.79, False),
+        ((C,), 1000.0, [1000.5 + 0.04 * number for number in range(8)], 1000.81, True),
+    ],
+)
+def test_the_three_seconds_begin_with_the_measurement_and_are_for_one_without_nodes(
+    members: tuple[str, ...], began: float, came: list[float], now: float, gathered: bool
+) -> None:
+    membership = Membership(began, {uuid: Member() for uuid in members})
+    for number, at in enumerate(came):
+        membership.arrive(f"{number:020x}", at)
+    assert membership.gathered(now) is gathered

@@ -52,6 +52,22 @@ def test_a_name_is_replaced_by_its_url_at_the_start_and_reported_if_it_is_gone(t
         DaemonSinks(tmp_path, actuators=True).open("lab")
 
 
+def test_a_folder_of_recordings_is_where_the_service_was_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is kept with the measurement, and the next start may be from elsewhere."""
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    sinks = DaemonSinks(tmp_path / "home", record=Path("rec"), actuators=False)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert sinks.whole("run.csv") == str(tmp_path / "rec" / "run.csv")
+    [own] = sinks.extra_sinks(KeptMeasurement("m", group="arm 1/2"), None)
+    assert own.name.startswith(str(tmp_path / "rec" / "arm_1_2-"))
+    assert own.name.endswith(".csv")
+    assert not (tmp_path / "home" / "recordings").exists()
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 @pytest.mark.parametrize(
     ("name", "url"),
     [("mqtt", LAB), ("ros1", LAB), ("a/b", LAB), ("", LAB), ("lab", "/etc/passwd.csv"), ("lab", "mqtts://x?cafile=/y")],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ from teds_provision.errors import (
     NotAuthenticError,
     NotFoundError,
     PolicyError,
+    StoreError,
     UsageError,
 )
 from teds_provision.ncap.nodes import provisioning
@@ -413,3 +415,58 @@ def test_a_calibration_is_of_the_form_that_its_name_ends_in(tmp_path: Path, name
     assert made.read_text() == "raw,value\n"
     with pytest.raises(UsageError, match=r"Unsupported calibration file: 'cell\.xls'"):
         provisioning._file(tmp_path, "x", "cell.xls")
+
+
+def test_a_full_disk_is_a_failure_of_the_store_and_leaves_the_run_before_it(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.runs.begin(NODE, **ORDER)
+    assert desk.tap(NODE)
+
+    def full(*_words: Any, **_facts: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    for patched in ((provisioning, "_file"), (tempfile, "TemporaryDirectory")):
+        with monkeypatch.context() as patch:
+            patch.setattr(*patched, full)
+            patch.setattr(tempfile, "tempdir", str(tmp_path))
+            with pytest.raises(StoreError) as failed:
+                desk.runs.begin(NODE, **ORDER)
+        assert failed.value.message == "No temporary file can be written: No space left on device."
+        assert failed.value.hint == f"Make room in {tmp_path}, then try again."
+        assert desk.state(NODE) == "done"
+        assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_node_that_is_tapped_at_the_very_end_of_its_time_is_provisioned(
+    begun: bool, desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its work has begun as the time is over: it is no longer waited for, and not failed."""
+
+    class Errand:
+        error: Exception | None = None
+
+        def __init__(self) -> None:
+            self.done = self
+            self.waits: list[float | None] = []
+
+        def wait(self, seconds: float | None = None) -> bool:
+            self.waits.append(seconds)
+            return seconds is None
+
+    errand, cleaned = Errand(), list[bool]()
+    monkeypatch.setattr(desk.jobs, "wait_for", lambda *_words: errand)
+    monkeypatch.setattr(desk.jobs, "cancel", lambda _job: not begun)
+    run = ProvisioningRun(NODE)
+    desk.runs._wait_for_a_tap(run, lambda _node: None, lambda: cleaned.append(True))
+    until(lambda: cleaned)
+    if begun:
+        assert (errand.waits, run.state, run.error) == ([300.0, None], "waiting", None)
+    else:
+        assert (errand.waits, run.state, run.waits_for, run.until) == ([300.0], "failed", None, None)
+        assert run.error == {
+            "code": "no-node",
+            "message": f"Node {NODE} was not placed on a reader within 300 s.",
+            "hint": "Try again, and hold its NFC antenna flat on the reader.",
+        }

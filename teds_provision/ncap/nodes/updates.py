@@ -120,7 +120,7 @@ class Updates:
                 image = self._kept.image_of(running[0])
             except TedsProvisionError as error:
                 for row in running[0].rows.values():
-                    if row.result is None:
+                    if row.result is None and row.state != "skipped":
                         row.state, row.result, row.error = "ended", "refused", problem_of(error)
                 self._end(running[0], "stopped")
             else:
