@@ -238,3 +238,207 @@ def test_a_service_that_others_could_listen_to_is_refused_at_its_start(settings:
         return
     with pytest.raises(UsageError, match=words):
         require_safe(settings)
+
+
+def test_the_service_ends_in_order_actuators_first_and_virtual_transducers_last(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An actuator is let go while its link is there, a measurement ends while its nodes answer."""
+    daemon, course = bench.daemon, list[str]()
+
+    def noted(owner: Any, name: str, what: str) -> None:
+        monkeypatch.setattr(owner, name, lambda *_words: course.append(what))
+
+    part, other = SimpleNamespace(), SimpleNamespace()
+    daemon.parts = {"a": part, "b": other}  # type: ignore[dict-item]
+    daemon.watches = [SimpleNamespace(place="can:x"), SimpleNamespace(place="nfc:y")]  # type: ignore[list-item]
+    for owner, name, what in (
+        (daemon.updates, "stop", "no further board"),
+        (daemon.leases, "end", "actuators"),
+        (daemon.measuring, "stop", "measurements"),
+        (daemon.buses, "close", "buses"),
+        (daemon.virtuals, "stop", "virtual transducers"),
+        (daemon.live.history, "close", "history"),
+        (daemon._observer, "join", "observer"),
+    ):
+        noted(owner, name, what)
+    for number, one in enumerate((part, other)):
+        monkeypatch.setattr(one, "stop", lambda number=number: course.append(f"part {number}"), raising=False)
+    for number, watch in enumerate(daemon.watches):
+        monkeypatch.setattr(watch, "stop", lambda number=number: course.append(f"link {number}"), raising=False)
+        monkeypatch.setattr(
+            watch, "join", lambda seconds: course.append(f"joined {0.1 <= seconds <= 8}"), raising=False
+        )
+    daemon._end()
+    assert course == [
+        "no further board", "part 0", "part 1", "actuators", "measurements", "link 0", "link 1", "buses",
+        "joined True", "joined True", "virtual transducers", "history", "observer",
+    ]  # fmt: skip
+    assert daemon._stop.is_set()
+
+
+@pytest.mark.parametrize(
+    ("settings", "course"),
+    [
+        (Settings(), ["kept", "updates"]),
+        (Settings(detection="whitelist"), ["kept", "updates"]),
+        (Settings(detection="transparent"), ["mode transparent", "kept", "updates"]),
+        (
+            Settings(measure="all", rate=5.0, frozen=True, unverified=True),
+            ["kept", "unverified 5.0", "all 5.0 True", "updates"],
+        ),
+    ],
+)
+def test_what_the_options_of_a_start_ask_for_begins_with_it(
+    settings: Settings, course: list[str], bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, found = bench.daemon, list[str]()
+    daemon.settings, daemon.watches = settings, []
+    assert daemon.detection == "whitelist"
+    measuring = daemon.measuring
+    for owner, name in ((daemon._observer, "start"), (daemon.live.history, "start"), (daemon, "_end")):
+        monkeypatch.setattr(owner, name, lambda: None)
+    monkeypatch.setattr(daemon, "set_detection", lambda mode: found.append(f"mode {mode}"))
+    monkeypatch.setattr(measuring, "start", lambda: found.append("kept"))
+    monkeypatch.setattr(measuring, "unverified", lambda *, rate: found.append(f"unverified {rate}"))
+    monkeypatch.setattr(measuring, "match", lambda text, *, rate, frozen: found.append(f"{text} {rate} {frozen}"))
+    monkeypatch.setattr(daemon.updates, "start", lambda: found.append("updates"))
+    with daemon.running():
+        assert found == course
+
+
+def test_a_node_that_answered_is_the_measurements_before_its_own_links(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another order would have a node inspected that a measurement waits for."""
+    daemon, course, port = bench.daemon, list[str](), object()
+    monkeypatch.setattr(daemon.measuring, "on_sighting", course.append)
+    daemon.watches = [
+        SimpleNamespace(port=at, on_sighting=lambda _sighting, name=name: course.append(name))  # type: ignore[list-item]
+        for name, at in (("other", object()), ("own", port))
+    ]
+    sighting: Any = SimpleNamespace(uuid=bytes.fromhex(NODE), port=port)
+    daemon._saw(sighting)
+    assert course == [NODE, "own"]
+    course.clear()
+    daemon._free_again(NODE)
+    assert course == [], "it is not there"
+    daemon.directory.note(NODE, "came", present=True)
+    daemon._free_again(NODE)
+    assert course == [NODE]
+
+
+@pytest.mark.parametrize(
+    ("job", "adopted", "changes", "served", "selected"),
+    [
+        (True, False, False, True, 1),
+        (False, True, False, True, 1),
+        (False, False, True, False, 1),
+        (False, False, False, False, 0),
+    ],
+)
+def test_after_what_was_done_with_a_node_the_measurements_select_again(
+    job: bool, adopted: bool, changes: bool, served: bool, selected: int, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node: Any = SimpleNamespace(identity=SimpleNamespace(state="factory"))
+    asked: list[str] = []
+
+    def adopt(_node: Any) -> bool:
+        asked.append("adopt")
+        if changes:
+            node.identity = SimpleNamespace(state="keyed")
+        return adopted
+
+    monkeypatch.setattr(bench.daemon.node_jobs, "serve", lambda _node: job)
+    monkeypatch.setattr(bench.daemon.adopting, "serve", adopt)
+    assert bench.daemon.serve_node(node) is served
+    assert (len(bench.selected), asked) == (selected, [] if job else ["adopt"])
+
+
+@pytest.mark.parametrize(
+    ("adopt", "mode", "adopts"),
+    [(True, "transparent", True), (True, "whitelist", False), (False, "transparent", False)],
+)
+def test_nodes_are_adopted_in_transparent_mode_alone(adopt: bool, mode: str, adopts: bool, bench: Bench) -> None:
+    bench.daemon.settings = Settings(adopt=adopt)
+    bench.daemon.set_detection(mode)
+    assert bench.daemon._adopts is adopts
+
+
+def test_the_state_of_the_service_counts_the_nodes_of_all_links(bench: Bench) -> None:
+    daemon = bench.daemon
+    other = Watched()
+    other.place, other.state = "nfc:usb", LinkState("nfc:usb")
+    daemon.watches = [bench.watch, other]  # type: ignore[list-item]
+    for uuid, place in ((NODE, "can:x"), (OTHER, "nfc:usb"), ("ef" * 10, "can:x")):
+        daemon.directory.note(uuid, "came", place=place, present=True)
+    daemon.directory.note("ef" * 10, "left", present=False)
+    status = daemon.status()
+    assert [(link["place"], link["via"], link["virtual"], link["nodes"]) for link in status["links"]] == [
+        ("can:x", "can", False, 1), ("nfc:usb", "nfc", False, 1),
+    ]  # fmt: skip
+    assert [(link["waiting"], link["notice"], link["problem"]) for link in status["links"]] == [(None, None, None)] * 2
+    assert (status["nodes"], status["strangers"], status["url"], status["foxglove"]) == (2, 0, None, None)
+    assert (status["plant"], status["actuators"], status["dead_man"], status["adopt"]) == (False, False, 1000, False)
+    assert status["vault"] == {"state": "open", "problem": None}
+    assert status["station"] == {"name": bench.station.name, "fingerprint": bench.station.fingerprint}
+    hello = daemon.first_message()
+    assert (hello["type"], hello["version"], hello["station"]) == ("hello", status["version"], bench.station.name)
+
+
+def test_every_link_is_asked_before_the_nodes_are_given(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[tuple[int, float]] = []
+    monkeypatch.setattr(bench.daemon._stop, "wait", lambda seconds: waited.append((bench.watch.looks, seconds)))
+    monkeypatch.setattr(bench.daemon.directory, "nodes", lambda: [{"uuid": NODE}] if waited else [])
+    assert bench.daemon.discover() == [{"uuid": NODE}]
+    assert waited == [(1, bench.daemon.waits.discovery)]
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_the_pages_address_has_a_token_and_there_is_none_without_a_page(bench: Bench, read_only: bool) -> None:
+    with pytest.raises(UsageError) as refused:
+        bench.daemon.login_url()
+    assert refused.value.hint == "Restart it with --http: ncap run --http 127.0.0.1:8351"
+    bench.daemon.url = "http://127.0.0.1:8351"
+    address, _, token = bench.daemon.login_url(read_only=read_only).partition("?token=")
+    assert address == "http://127.0.0.1:8351/login"
+    cookie = bench.daemon.tokens.login(token)
+    assert cookie is not None
+    found = bench.daemon.tokens.find(cookie)
+    assert found is not None
+    assert found.read_only is read_only
+
+
+def test_a_virtual_transducer_that_is_measured_is_not_removed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, course, measured = bench.daemon, list[Any](), ["m1"]
+    monkeypatch.setattr(daemon.measuring, "measurement_of", lambda _uuid: measured[0] if measured else None)
+    monkeypatch.setattr(
+        daemon.virtuals, "forget", lambda uuid: course.append(daemon.node_locks.holder(uuid) is not None) or uuid
+    )
+    monkeypatch.setattr(daemon.virtuals, "end", lambda one: course.append(("end", one)))
+    daemon.directory.note(NODE, "came", present=True)
+    with pytest.raises(FrozenError) as refused:
+        daemon.drop_virtual(NODE)
+    assert (refused.value.message, refused.value.hint) == (
+        f"Node {NODE} is being measured.",
+        "End the measurement first.",
+    )
+    assert (course, daemon.directory.seen(NODE).present) == ([], True)
+    measured.clear()
+    daemon.drop_virtual(NODE)
+    assert (course, daemon.directory.seen(NODE).present) == ([True, ("end", NODE)], False)
+    assert daemon.node_locks.holder(NODE) is None
+
+
+def test_a_group_that_does_not_exist_is_neither_changed_nor_deleted_and_who_did_is_in_the_log(bench: Bench) -> None:
+    daemon = bench.daemon
+    for change in (lambda: daemon.change_group("arm", []), lambda: daemon.drop_group("arm")):
+        with pytest.raises(NotFoundError):
+            change()
+    assert (bench.events, bench.selected) == ([], [])
+    daemon.make_group("arm", [])
+    with pytest.raises(UsageError):
+        daemon.make_group("arm", [NODE])
+    daemon.drop_group("arm")
+    assert bench.outcomes("group")[-1:] == ["deleted"]
+    assert (bench.events, len(bench.selected)) == ([("group", "changed")] * 2, 2)

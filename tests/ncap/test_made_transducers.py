@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Iterator
 from contextlib import nullcontext
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import KnownUuidError, NotFoundError, UsageError
+from teds_provision.ncap.nodes import virtual
 from teds_provision.ncap.nodes.simulation import Feed
 from teds_provision.ncap.nodes.virtual import MOST, Virtual, Virtuals
 from teds_provision.protocol.announce import default_can_address
@@ -200,3 +203,75 @@ def test_what_is_known_of_one_is_in_its_folder(bench: Bench) -> None:
         made.uuid, "simulation", "load-cell", 1,
     )  # fmt: skip
     assert made.name == facts["name"] != "", "the profile's"
+
+
+def test_straight_lines_are_for_channels_that_have_a_range_and_no_values_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the unit that people read, over the whole raw range; a datasheet's own calibration stays as it is."""
+
+    def channel(number: int, **changed: Any) -> Any:
+        unit = SimpleNamespace(text="mm", from_si=lambda value: value * 1000.0)
+        facts = {"value_problem": "It has no calibration.", "has_range": True, "calibration_problem": "", "unit": unit}
+        sample = SimpleNamespace(raw_range=(0, 4095))
+        return SimpleNamespace(number=number, sample=sample, low=0.0, high=0.25, **facts | changed)
+
+    def now(zone: Any) -> datetime:
+        return datetime(2026, 3, 1, tzinfo=zone)
+
+    monkeypatch.setattr(virtual, "datetime", SimpleNamespace(now=now))
+    channels = [
+        channel(1),
+        channel(2, value_problem=""),
+        channel(3, has_range=False),
+        channel(4, calibration_problem="Its length is wrong."),
+        channel(7),
+    ]
+    channels[4].sample.raw_range = (-5.0, 5.0)
+    without, unknown = channel(5), channel(6)
+    without.sample, unknown.sample.raw_range = None, None
+    sheet: Any = SimpleNamespace(channels=[*channels[:4], without, unknown, channels[4]])
+    assert virtual.ideal_calibration(sheet) == (
+        '[[calibration]]\nchannel = 1\ndate = 2026-03-01\nunit = "mm"\npoints = [[0, 0.0], [4095, 250.0]]\n'
+        '\n[[calibration]]\nchannel = 7\ndate = 2026-03-01\nunit = "mm"\npoints = [[-5.0, 0.0], [5.0, 250.0]]\n'
+    )
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("sine:86400", None),
+        ("ramp:0.5", None),
+        ("simulation", None),
+        ("unix:/run/feed", None),
+        ("file:/day.csv", None),
+        ("sine:86401", "is longer than a day"),
+        ("ramp:86401", "is longer than a day"),
+        ("sine:x", "is not a valid source"),
+        ("file:day.csv", "is not a valid source"),
+        ("noise\n", "is not a valid source"),
+        ("noise:2", "is not a valid source"),
+        ("simulation:/x", "is not a valid source"),
+    ],
+)
+def test_a_source_is_one_that_its_process_takes(source: str, words: str | None) -> None:
+    with pytest.raises(UsageError, match=words) if words else nullcontext():
+        virtual._check_source(source)
+
+
+@pytest.mark.parametrize(("running", "stubborn"), [(False, False), (True, False), (True, True)])
+def test_a_process_is_asked_to_end_and_has_five_seconds(running: bool, stubborn: bool) -> None:
+    course: list[Any] = []
+
+    def wait(seconds: float) -> None:
+        course.append(seconds)
+        if stubborn:
+            raise subprocess.TimeoutExpired("node", seconds)
+
+    process: Any = SimpleNamespace(
+        poll=lambda: None if running else 0,
+        terminate=lambda: course.append("asked"),
+        wait=wait,
+        kill=lambda: course.append("killed"),
+    )
+    virtual._end(process)
+    assert course == ([] if not running else ["asked", 5.0, "killed"] if stubborn else ["asked", 5.0])
+    virtual._end(None)
