@@ -138,13 +138,18 @@ def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) ->
         ("t,angle\nx,1\n", "line 2"),
         ("t,angle\n0,x\n", "line 2"),
         ("t,angle\n\n#\n,1\n", "line 4"),
+        ("t,angle\n0,1\n2,1\n1,1\n", "line 4: times must be ascending"),
+        ("t,angle\n0,1,2\n", "line 2: 3 fields, the first line names 2"),
+        ("t,angle,\n0,1,2\n", "no sensor named ''"),
+        ('t,angle\n0,"1\n"\n', "quotation mark"),
+        (f"t,angle\n0,{'1' * 131_073}\n", "is not CSV"),
     ],
 )
 def test_a_bad_file_is_reported_with_its_line(tmp_path: Path, text: str, place: str) -> None:
     path = tmp_path / "run.csv"
     path.write_text(text)
     with pytest.raises(BadDataError, match=place):
-        make_source(f"file:{path}", PLACES, print)
+        make_source(f"file:{path}", (*PLACES, SourceChannel(4, "")), print)
 
 
 def test_rows_and_columns_of_a_file_are_read_as_the_page_has_them(tmp_path: Path) -> None:
@@ -170,6 +175,13 @@ def test_rows_and_columns_of_a_file_are_read_as_the_page_has_them(tmp_path: Path
     assert source.at(3, 4.6) is None, "a channel without a column hears of the end too"
     assert force(4.51, 9.0) + angle(4.51) == [None] * 3
     assert messages == ["The file of values has ended: from now on all values are invalid."]
+
+
+def test_the_last_of_two_rows_is_valid_as_long_as_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("t,force\n5,1\n7,2\n")
+    source = make_source(f"file:{path}", PLACES, print)
+    assert (source.at(2, 4.0), source.at(2, 4.01)) == (Reading(value=2.0), None)
 
 
 def test_a_file_of_one_row_is_valid_at_its_instant_alone(tmp_path: Path) -> None:
@@ -400,6 +412,16 @@ def test_standard_input_ends_and_the_node_stays() -> None:
         assert wait_for(lambda: messages)
         assert messages == ["Standard input has ended: from now on all values are invalid."]
         source.stop()
+
+
+def test_a_file_at_the_path_of_a_socket_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("mine")
+    source = make_source(f"unix:{path}", PLACES, print)
+    with pytest.raises(NoReaderError) as refused:
+        source.start(Clock())
+    source.stop()
+    assert (path.read_text(), refused.value.hint) == ("mine", "Name another path.")
 
 
 def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from teds_provision.teds.profile import (
     shipped_profiles,
     template,
 )
+from teds_provision.teds.profile.load import parse_profile
 from teds_provision.teds.profile.model import CalibrationDemand
 from teds_provision.teds.profile.reader import key_lines
 from teds_provision.teds.show import describe
@@ -305,6 +306,22 @@ def test_a_circle_of_profiles_is_refused(circle: tuple[str, ...], tmp_path: Path
 def test_a_users_profile_may_extend_the_shipped_one_of_the_same_name(tmp_path: Path) -> None:
     path = write(tmp_path, "load-cell", 'extends = "load-cell"\n[channel.1]\nhigh-limit = 100\nlow-limit = -100\n')
     assert load_profile(path, [tmp_path, shipped_profiles()]).channels[0].high_limit == 100
+
+
+def test_what_a_text_without_a_file_extends_is_never_a_file_of_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """docs/formats.md: a file in the working folder never replaces a type that comes with the tool."""
+    shipped_one = load_profile("load-cell", [shipped_profiles()])
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, "load-cell", GOOD)
+    (tmp_path / "profiles").mkdir()
+    write(tmp_path / "profiles", "load-cell", GOOD)
+    write(tmp_path / "profiles", "own-cell", GOOD)
+    assert parse_profile('extends = "load-cell"\n').channels == shipped_one.channels
+    assert parse_profile('extends = "own-cell"\n').channels[0].high_limit == 10
+    beside = load_profile(write(tmp_path, "mine", 'extends = "load-cell"\n'))
+    assert beside.channels[0].high_limit == 10, "what a file extends may lie beside it"
 
 
 def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Reco
 def read(path: Path, places: Sequence[SourceChannel], notify: Notify) -> RecordedSource:
     """Read a file of at most 256 MiB whole."""
     lines = _lines(path)
-    fields = list(csv.reader(line for _, line in lines))
+    fields = _fields(path, lines)
     header = [name.strip() for name in fields[0]]
     columns = _columns(path, header, places)
     at = next(index for index, name in enumerate(header) if name.lower() in _TIME_NAMES)
@@ -73,6 +73,17 @@ def read(path: Path, places: Sequence[SourceChannel], notify: Notify) -> Recorde
         for number, index, raw in columns:
             readings[number].append(_reading(_number(path, line, row[index]), raw=raw))
     return RecordedSource(places, [time - times[0] for time in times], readings, notify)
+
+
+def _fields(path: Path, lines: list[tuple[int, str]]) -> list[list[str]]:
+    """Return the fields of each line; raises BadDataError for a field that is too long or ends in another line."""
+    try:
+        fields = list(csv.reader(line for _, line in lines))
+    except csv.Error as error:
+        raise BadDataError(f"{path} is not CSV: {error}.") from error
+    if len(fields) != len(lines):
+        raise BadDataError(f"{path} is not CSV: a quotation mark is not closed in its line.")
+    return fields
 
 
 def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> Iterator[tuple[int, list[str]]]:

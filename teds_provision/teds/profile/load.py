@@ -230,7 +230,8 @@ def files_digest(path: Path, folders: Sequence[Path]) -> str:
 
 
 def _base(name: str, where: SourcePlace, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path:
-    places = list(dict.fromkeys((path.parent, *folders)))
+    beside = (path.parent,) if chain else ()  # a text without a file has nothing beside it
+    places = list(dict.fromkeys((*beside, *folders)))
     try:
         return _by_name(name, places, chain)
     except NotFoundError as error:

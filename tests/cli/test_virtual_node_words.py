@@ -1,0 +1,330 @@
+"""``node create``, ``node run`` and ``node reset``: what they print and refuse (docs/virtual-nodes.md)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.cli.node.virtual_nodes import ActuatorLines
+from teds_provision.node.flash_file import FlashFile
+from teds_provision.node.hardware.board import ActuatorReading
+from teds_provision.protocol.keys import fingerprint
+from tests.e2e.desk import ROOT
+
+from .shell import call
+
+UUID = "8d4d9da65281f7000000"
+DBC = ROOT / "examples" / "bench" / "torque.dbc"
+
+
+class Printed:
+    """The command's output: JSON objects with the lines for people."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[dict[str, Any], str]] = []
+        self.fails = False
+
+    def emit(self, record: dict[str, Any], text: str) -> None:
+        if self.fails:
+            raise BrokenPipeError
+        self.lines.append((record, text))
+
+    @property
+    def words(self) -> list[str]:
+        return [text for _, text in self.lines]
+
+
+class Pause:
+    """The pauses between two prints; ``meanwhile`` is called in each."""
+
+    def __init__(self, *meanwhile: Callable[[], None]) -> None:
+        self.seconds: list[float] = []
+        self._meanwhile = list(meanwhile)
+        self._set = False
+
+    def is_set(self) -> bool:
+        return self._set
+
+    def set(self) -> None:
+        self._set = True
+
+    def wait(self, seconds: float) -> bool:
+        self.seconds.append(seconds)
+        self._meanwhile.pop(0)()
+        self._set = self._set or not self._meanwhile
+        return self._set
+
+
+def lines_on(printed: Printed, *meanwhile: Callable[[ActuatorLines], None]) -> tuple[ActuatorLines, Pause]:
+    made: Any = ActuatorLines(printed)  # type: ignore[arg-type]
+    pause = made._stop = Pause(*[lambda step=step: step(made) for step in meanwhile])  # type: ignore[misc]
+    return made, pause
+
+
+def state(value: float | None, *, channel: int = 1, safe: bool = False, name: str = "grip", unit: str = "m") -> Any:
+    return ActuatorReading(channel, name, value, unit, 7.0, safe, 1_700_000_000.25)
+
+
+def test_an_actuator_prints_at_most_20_lines_a_second_and_always_its_last_state() -> None:
+    printed = Printed()
+
+    def many(lines: ActuatorLines) -> None:
+        for number in range(100):
+            lines.observer_of("aa")(state(float(number)))
+            lines.observer_of("aa")(state(number / 2, channel=2))
+            lines.observer_of("bb")(state(-1.0))
+
+    lines, pause = lines_on(printed, many, lambda lines: lines.observer_of("aa")(state(99.0)), many)
+    lines.observer_of("aa")(state(0.5))
+    lines._run()
+    assert printed.words == ["aa grip: 0.5 m", "aa grip: 99 m", "aa grip: 49.5 m", "bb grip: -1 m"]
+    assert pause.seconds == [0.05] * 3, "a state that was printed is not printed again"
+
+
+def test_the_line_of_an_actuator_in_words_and_json() -> None:
+    printed = Printed()
+    lines, _ = lines_on(printed, lambda _: None)
+    for number, reading in enumerate(
+        (
+            state(0.25),
+            state(0.0, safe=True),
+            state(None),
+            state(2.0, name="", unit=""),
+            ActuatorReading(5, "valve", None, "m", math.nan, True, 0.0),
+        )
+    ):
+        lines.observer_of(f"n{number}")(reading)
+    lines._run()
+    assert printed.words == [
+        "n0 grip: 0.25 m",
+        "n1 grip: safe state, 0 m",
+        "n2 grip: raw 7",
+        "n3 channel 1: 2",
+        "n4 valve: safe state, raw nan",
+    ]
+    assert printed.lines[1][0] == {
+        "event": "actuator",
+        "uuid": "n1",
+        "channel": 1,
+        "name": "grip",
+        "value": 0.0,
+        "unit": "m",
+        "raw": 7.0,
+        "safe": True,
+        "time": "2023-11-14T22:13:20.250Z",
+    }
+    assert (printed.lines[3][0]["name"], printed.lines[4][0]["raw"]) == ("", None)
+
+
+def test_events_of_nodes_in_words_and_json_and_before_the_states() -> None:
+    printed = Printed()
+    lines, _ = lines_on(printed, lambda _: None)
+    lines.observer_of("aa")(state(1.0))
+    report = lines.validity_of("aa")
+    report(2, "torque", "no frame for 30 ms")
+    report(2, "torque", "")
+    lines.locate_of("bb")(10)
+    lines.locate_of("bb")(0)
+    lines.note_reset("cc")
+    lines._run()
+    assert printed.words == [
+        "aa torque: invalid: no frame for 30 ms",
+        "aa torque: valid again",
+        "bb: blinks for 10 s",
+        "bb: stops",
+        "cc: reset by hand, back in factory state",
+        "aa grip: 1 m",
+    ]
+    events = [{key: value for key, value in record.items() if key != "time"} for record, _ in printed.lines[:5]]
+    assert events == [
+        {"event": "invalid", "uuid": "aa", "channel": 2, "name": "torque", "reason": "no frame for 30 ms"},
+        {"event": "valid", "uuid": "aa", "channel": 2, "name": "torque"},
+        {"event": "locate", "uuid": "bb", "seconds": 10},
+        {"event": "locate", "uuid": "bb", "seconds": 0},
+        {"event": "reset", "uuid": "cc", "state": "factory"},
+    ]
+    assert all(record["time"].endswith("Z") for record, _ in printed.lines)
+
+
+def test_of_events_that_nobody_reads_the_last_thousand_are_kept() -> None:
+    printed = Printed()
+    lines, _ = lines_on(printed, lambda _: None)
+    for number in range(1001):
+        lines.locate_of("aa")(number + 1)
+    lines._run()
+    assert (len(printed.lines), printed.words[0], printed.words[-1]) == (
+        1000,
+        "aa: blinks for 2 s",
+        "aa: blinks for 1001 s",
+    )
+
+
+@pytest.mark.parametrize("kind", ["event", "state"])
+def test_a_node_whose_output_nobody_takes_prints_no_more_and_goes_on(kind: str) -> None:
+    printed = Printed()
+    printed.fails = True
+    lines, pause = lines_on(printed, lambda _: None)
+    (lines.note_reset if kind == "event" else lambda uuid: lines.observer_of(uuid)(state(1.0)))("aa")
+    lines._run()
+    assert (printed.lines, pause.is_set()) == ([], True)
+
+
+def test_what_is_left_at_the_end_is_printed() -> None:
+    printed = Printed()
+    lines = ActuatorLines(printed)  # type: ignore[arg-type]
+    lines.start()
+    lines.observer_of("aa")(state(0.0, safe=True))
+    lines.stop()
+    assert printed.words == ["aa grip: safe state, 0 m"]
+    ActuatorLines(printed).stop()  # type: ignore[arg-type]
+
+
+# -- create ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_created_node_is_shown_whole(home: Path, tmp_path: Path) -> None:
+    made = call(home, "node", "create", tmp_path / "a", "--uuid", f"0x{UUID}", "--name", "plain")
+    key = fingerprint(FlashFile(tmp_path / "a").load().node_key)
+    address = FlashFile(tmp_path / "a").load().can_address
+    start = f"Node {UUID} in {tmp_path / 'a'}, key {key[:16]}, CAN address 0x{address:02x}"
+    assert made.out == f"{start}.\n"
+    again = call(home, "--json", "node", "create", tmp_path / "a", "--uuid", UUID, "--name", "plain")
+    assert again.json == {
+        "uuid": UUID,
+        "fingerprint": key,
+        "name": "plain",
+        "can_address": address,
+        "channels": [],
+        "origin": None,
+        "firmware": None,
+    }
+    made = call(home, "node", "create", tmp_path / "b", "--profile", "limit-switch")
+    assert made.out.endswith(", 1 channel.\n")
+    made = call(home, "--json", "node", "create", tmp_path / "c", "--profile", "gripper")
+    assert [(each["channel"], each["kind"], each["unit"]) for each in made.json["channels"]] == [
+        (1, "actuator", "m"),
+        (2, "sensor", "m"),
+        (3, "sensor", "N"),
+    ]
+    assert call(home, "node", "create", tmp_path / "d", "--profile", "gripper").out.endswith(", 3 channels.\n")
+
+
+def test_a_wrapped_node_is_shown_with_its_sensor(home: Path, tmp_path: Path) -> None:
+    words = ("node", "create", tmp_path / "a", "--from", f"dbc:{DBC}", "--message", "Torque")
+    made = call(home, "--json", *words)
+    assert made.json["origin"]["kind"] == "dbc"
+    assert [each["name"] for each in made.json["channels"]] == ["torque", "speed", "temperature", "state"]
+    assert made.json["channels"][3]["choices"]["2"] == "overload"
+    assert call(home, *words).out.endswith(", 4 channels, wraps CAN message Torque (dbc).\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--profile", "gripper", "--from", "iio:x"), "--profile and --from cannot be combined."),
+        (("--message", "Torque"), "--message needs --from dbc:FILE."),
+        (("--new-uuid",), "--new-uuid replaces the UUID in a file."),
+        (("--new-uuid", "--teds", "FILE", "--uuid", UUID), "--new-uuid replaces the UUID in a file."),
+        (("--firmware", "FILE"), "--firmware and --firmware-key belong together."),
+        (("--firmware-key", "FILE"), "--firmware and --firmware-key belong together."),
+        (("--uuid", UUID[:-1]), "a UUID has 20 hex digits."),
+        (("--uuid", UUID + "00"), "a UUID has 20 hex digits."),
+        (("--name", "a\nb"), "a name has at most 120 octets of printable text; this one has 3."),
+        (("--name", "ä" * 61), "a name has at most 120 octets of printable text; this one has 122."),
+    ],
+    ids=lambda value: None if isinstance(value, str) else " ".join(value)[:40],
+)
+def test_options_of_create_that_do_not_go_together(
+    home: Path, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("{}")
+    done = call(home, "--json", "node", "create", tmp_path / "a", *(file if word == "FILE" else word for word in words))
+    assert (done.code, message in json.dumps(done.json, ensure_ascii=False)) == (2, True), done
+    assert not (tmp_path / "a").exists()
+
+
+# -- run ---------------------------------------------------------------------------------------------------------------
+
+NFC, CAN = ("--nfc", "udp:localhost:1"), ("--can", "udp_multicast:239.1.2.3")
+
+
+@pytest.mark.parametrize(
+    ("count", "words", "message"),
+    [
+        (1, (), "A node needs a link."),
+        (2, NFC, "--nfc supports one node only."),
+        (2, (*NFC, *CAN), "--nfc supports one node only."),
+        (2, ("--ble", "usb:0"), "--ble supports one node only."),
+        (2, (*CAN, "--source", "-"), "--source - supports one node only."),
+        (2, (*CAN, "--source", "unix:/x"), "--source unix:/x supports one node only."),
+        (1, (*CAN, "--bus", "virtual:x"), "--bus names wrapped sensors."),
+        (1, (*CAN, "--node-id", "5"), "--node-id names wrapped sensors."),
+        (1, (*CAN, "--source", "sinus:2"), "--source 'sinus:2' is not known."),
+        (1, (*CAN, "--source", f"dbc:{DBC}", "--bus", "virtual:x"), "wraps no sensor."),
+        (1, (*CAN, "--source", "dbc:", "--bus", "virtual:x"), "--source dbc: needs a file or device."),
+    ],
+    ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) else None,
+)
+def test_options_of_run_that_do_not_go_together(
+    home: Path, tmp_path: Path, count: int, words: tuple[str, ...], message: str
+) -> None:
+    folders = [tmp_path / f"node{number}" for number in range(count)]
+    for folder in folders:
+        FlashFile.create(folder)
+    done = call(home, "--json", "node", "run", *folders, *words)
+    assert (done.code, message in json.dumps(done.json, ensure_ascii=False)) == (2, True), done
+
+
+def test_a_wrapped_node_runs_from_no_other_source_nor_file(home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    call(home, "node", "create", folder, "--from", f"dbc:{DBC}", "--message", "Torque")
+    run = ("--json", "node", "run", folder, *CAN)
+    done = call(home, *run)
+    assert done.code == 2
+    assert done.json["error"]["message"] == (
+        f"The node in {folder} wraps CAN message Torque (dbc), so --source noise cannot give its values."
+    )
+    assert done.json["error"]["hint"] == "Use --source dbc:FILE."
+    done = call(home, *run, "--source", "canopen:x.eds", "--bus", "virtual:x", "--node-id", "5")
+    assert done.json["error"]["message"] == (
+        f"Node {folder} wraps a sensor of kind dbc, which --source canopen does not read."
+    )
+    other = tmp_path / "other.dbc"
+    other.write_bytes(DBC.read_bytes() + b"\n")
+    done = call(home, *run, "--source", f"dbc:{other}", "--bus", "virtual:x")
+    assert (done.code, done.json["error"]["message"]) == (
+        6,
+        f"{other} is not the file that the node was made from: channels, units or ranges may differ.",
+    )
+    done = call(home, *run, "--source", f"dbc:{DBC}")
+    assert (done.code, done.json["error"]["message"]) == (2, "--source dbc needs the bus of the sensors.")
+
+
+def test_a_reset_by_hand_and_its_plan(home: Path, tmp_path: Path) -> None:
+    for number, (words, out) in enumerate(
+        (
+            (("--dry-run",), f"Plan: reset node {UUID} to factory state.\n"),
+            (("--dry-run", "--json"), {"uuid": UUID, "plan": "reset"}),
+            ((), f"Node {UUID} is back in factory state.\n"),
+            (("--json",), {"uuid": UUID, "state": "factory"}),
+        )
+    ):
+        folder = tmp_path / str(number)
+        FlashFile.create(folder, uuid=bytes.fromhex(UUID))
+        before = (folder / "flash.json").read_bytes()
+        done = call(
+            home,
+            *(("--json",) if "--json" in words else ()),
+            "node",
+            "reset",
+            folder,
+            *words[:1][: "--dry-run" in words],
+        )
+        assert (done.json if isinstance(out, dict) else done.out) == out
+        assert "--dry-run" not in words or (folder / "flash.json").read_bytes() == before
