@@ -79,10 +79,20 @@ def test_an_actuator_prints_at_most_20_lines_a_second_and_always_its_last_state(
             lines.observer_of("aa")(state(number / 2, channel=2))
             lines.observer_of("bb")(state(-1.0))
 
-    lines, pause = lines_on(printed, many, lambda lines: lines.observer_of("aa")(state(99.0)), many)
+    def at_the_end(lines: ActuatorLines) -> None:
+        many(lines)
+        lines.observer_of("bb")(state(0.0, safe=True))
+
+    lines, pause = lines_on(printed, many, lambda lines: lines.observer_of("aa")(state(99.0)), at_the_end)
     lines.observer_of("aa")(state(0.5))
     lines._run()
-    assert printed.words == ["aa grip: 0.5 m", "aa grip: 99 m", "aa grip: 49.5 m", "bb grip: -1 m"]
+    assert printed.words == [
+        "aa grip: 0.5 m",
+        "aa grip: 99 m",
+        "aa grip: 49.5 m",
+        "bb grip: -1 m",
+        "bb grip: safe state, 0 m",
+    ]
     assert pause.seconds == [0.05] * 3, "a state that was printed is not printed again"
 
 
