@@ -202,6 +202,19 @@ def test_intel_hex_with_segment_base_and_start_records_of_other_tools():
     assert stretches(text) == [(0x10000, b"\x00\x00\x0a")]
 
 
+def test_a_comment_of_hex_places_any_u16_channel_and_u8_access_code_and_no_others():
+    for place in ((65535, 255), (0, 0)):
+        text = f"# channel {place[0]} access code {place[1]}\n{NAME.hex()}\n"
+        assert read_blocks(text.encode(), "hex") == [TedsBlock(*place, NAME)]
+    for channel, code in ((65536, 1), (1, 256)):
+        with pytest.raises(BadDataError, match=f"Line 2 names channel {channel} and access code {code}"):
+            read_blocks(f"# ours\n# channel {channel} access code {code}\n00\n".encode(), "hex")
+
+
+def test_a_record_of_intel_hex_without_octets_is_no_stretch():
+    assert stretches(":00002000E0\n:0100000001FE\n:00000001FF\n") == [(0, b"\x01")]
+
+
 def test_an_image_needs_a_uuid_and_places():
     image = json.loads(write_blocks([TedsBlock(0, 1, META), TedsBlock(1, 12, NAME)], "image"))
     assert (image["uuid"], len(image["blocks"])) == ("00010203040506070809", 2)

@@ -145,3 +145,8 @@ def test_a_key_that_the_interface_does_not_have_is_refused_with_those_that_it_ha
     with pytest.raises(UsageError, match=r"^--can udp_multicast has no key 'prot'\.$") as refused:
         parse_spec("udp_multicast:239.74.163.2?prot=4000").require_known()
     assert {"port", "hop_limit", "node", "source", "pace", "fd"} <= set(refused.value.hint[8:-1].split(", "))
+
+
+def test_an_interface_whose_keys_are_not_known_takes_any() -> None:
+    parse_spec("made_by_us:0?speed=3").require_known()
+    parse_spec("socketcan:can0").require_known()
