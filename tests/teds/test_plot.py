@@ -137,3 +137,111 @@ def test_a_thinned_curve_is_drawn_from_its_first_point_to_its_last() -> None:
     drawn = plot._View._thinned(cast(Any, None), mask)
     assert (drawn[0], drawn[-1]) == (3, 10_000)
     assert 1_900 < len(drawn) < 2_700
+
+
+class Axes:
+    """One diagram, which notes what is drawn in it."""
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *values, **how: self.drawn.append((name, values, how))
+
+    def all(self, name: str, **how: Any) -> list[tuple[Any, ...]]:
+        """Return what was drawn in this way."""
+        return [
+            values
+            for drawn, values, given in self.drawn
+            if drawn == name and all(given.get(key) == value for key, value in how.items())
+        ]
+
+    def text(self, name: str) -> str:
+        """Return the last text of this kind."""
+        return str(self.all(name)[-1][0])
+
+
+def drawn(blocks: Any, calibrations: Any = None, number: int = 0) -> tuple[Axes, Axes]:
+    """Return the two diagrams of a channel: the curve, and the residuals or departures."""
+    upper, lower = Axes(), Axes()
+    where: Any = type("Where", (), {"subplots": lambda *_, **__: (upper, lower)})()
+    plot._draw(where, plot._panels(blocks, None, None, calibrations or {})[number])
+    return upper, lower
+
+
+def test_each_part_of_a_picture_is_where_it_belongs(finger) -> None:  # type: ignore[no-untyped-def]
+    rows = "".join(f"{raw},{raw / 6553.5 + 0.05 * (raw // 1000 % 2)}\n" for raw in (6000, 20000, 35000, 60000))
+    calibrations = read_calibrations(f"# channel: 1\n# method: linear\n# date: 2026-10-31\n{rows}", "x.csv", finger)
+    blocks = finger.build(UUID, calibration=calibrations).blocks
+    upper, lower = drawn(blocks, calibrations)
+    assert upper.text("set_title") == "channel 1: taxel 1\nlinear, 2026-10-31, due 2027-04-29"
+    assert (upper.text("set_ylabel"), lower.text("set_xlabel")) == ("value [N]", "raw")
+    ((inside, values),) = upper.all("plot", label="calibration")
+    assert (inside.min(), inside.max()) == (pytest.approx(6000, abs=40), pytest.approx(60000, abs=40))
+    assert values[-1] == pytest.approx(60000 / 6553.5, abs=0.1), "in the calibrated unit"
+    beyond = [values[0] for values in upper.all("plot", linestyle=":")]
+    assert [(side.min(), side.max()) for side in beyond] == [
+        (0, pytest.approx(6000, abs=40)),
+        (pytest.approx(60000, abs=40), 65535),
+    ]
+    assert len(upper.all("plot", label="extrapolated")) == 1, "named once"
+    ((x, y, _),) = upper.all("plot", label="4 points")
+    assert list(x) == [6000, 20000, 35000, 60000]
+    assert y[0] == pytest.approx(6000 / 6553.5)
+    assert [values[0] for values in upper.all("axhline")] == [pytest.approx(0.0), pytest.approx(10.0)]
+    assert len(upper.all("axhline", label="limits ± uncertainty")) == 1
+    assert upper.all("axhspan") == [
+        (pytest.approx(-0.2), pytest.approx(0.2)),
+        (pytest.approx(9.8), pytest.approx(10.2)),
+    ]
+    assert (lower.text("set_ylabel"), lower.all("axhline", linestyle="--")) == (
+        "point - curve",
+        [(pytest.approx(-0.2),), (pytest.approx(0.2),)],
+    )
+    caption = lower.text("set_title")
+    assert caption.startswith("residuals: largest 0.0")
+    assert caption.endswith("; stated uncertainty 0.2 (dashed)")
+    exact = read_calibrations("# channel: 1\n0,0\n65535,10\n", "x.csv", finger)
+    _, lower = drawn(finger.build(UUID, calibration=exact).blocks, exact)
+    assert lower.text("set_title").endswith("; stated uncertainty 0.2, far outside")
+    assert lower.all("axhline", linestyle="--") == []
+
+
+def test_without_points_the_bend_of_the_curve_is_drawn(finger) -> None:  # type: ignore[no-untyped-def]
+    made = read_calibrations("# channel: 1\n# method: table\n0,0\n30000,4\n65535,10\n", "x.csv", finger)
+    upper, lower = drawn(finger.build(UUID, calibration=made).blocks)
+    ((x, y, _),) = upper.all("plot", label="3 nodes")
+    assert (list(x), list(y)) == ([0, 30000, 65535], pytest.approx([0, 4, 10]))
+    assert lower.text("set_ylabel") == "curve - line"
+    assert lower.text("set_title").startswith("departure from a straight line: largest 0.")
+    assert "stated uncertainty 0.2 (dashed)" in lower.text("set_title")
+
+
+def test_a_picture_of_an_actuator_has_raw_numbers_over_values() -> None:
+    gripper = load_profile("gripper", [shipped_profiles()])
+    calibrations = read_calibrations("# channel: 1\n0,0\n2000,60\n4095,110\n", "x.csv", gripper)
+    upper, lower = drawn(gripper.build(UUID, calibration=calibrations).blocks, calibrations)
+    assert (upper.text("set_ylabel"), lower.text("set_xlabel")) == ("raw", "value [mm]")
+    ((x, y, _),) = upper.all("plot", label="3 points")
+    assert (list(x), list(y)) == ([0, 60, 110], [0, 2000, 4095])
+    assert [values[0] for values in upper.all("axhline")] == [0, 4095]
+    assert upper.all("axhspan") == []
+    assert "uncertainty" not in lower.text("set_title")
+
+
+def test_a_curve_over_the_end_of_a_turn_has_a_gap_there() -> None:
+    angle = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+    made = read_calibrations("# zero-offset: 90\n0,0\n65535,360\n", "x.csv", angle)
+    upper, _ = drawn(angle.build(UUID, calibration=made).blocks)
+    ((_, values),) = upper.all("plot", label="calibration")
+    assert np.isnan(values).sum() == 1
+    kept = values[~np.isnan(values)]
+    assert (kept.min() >= 0, kept.max() <= 360) == (True, True)
+    assert float(np.nanmax(np.abs(np.diff(kept)))) > 300
+
+
+def test_25_channels_do_not_fit_one_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plot, "_panels", lambda *_: [None] * 25)
+    with pytest.raises(UsageError, match="25 channels do not fit one picture") as refused:
+        plot_blocks({}, tmp_path / "x.svg")
+    assert refused.value.hint == "Choose one with --channel."
