@@ -256,6 +256,64 @@ def test_iio_facts_of_a_channel_go_before_those_of_its_type(sysfs: Callable[...,
 
 
 @pytest.mark.parametrize(
+    ("kind", "unit", "value"),
+    [
+        ("voltage", "mV", 500.0), ("altvoltage", "mV", 500.0), ("current", "mA", 500.0), ("power", "mW", 500.0),
+        ("temp", "degC", 0.5), ("accel", "m/s²", 500.0), ("gravity", "m/s²", 500.0), ("anglvel", "rad/s", 500.0),
+        ("angl", "rad", 500.0), ("incli", "degree", 500.0), ("rot", "degree", 500.0), ("magn", "T", 0.05),
+        ("pressure", "kPa", 500.0), ("humidityrelative", "%", 0.5), ("positionrelative", "%", 0.5),
+        ("illuminance", "lx", 500.0), ("distance", "m", 500.0), ("velocity", "m/s", 500.0),
+        ("resistance", "Ω", 500.0), ("capacitance", "nF", 500.0), ("energy", "J", 500.0),
+        ("concentration", "%", 500.0), ("electricalconductivity", "S/m", 500.0),
+    ],
+)  # fmt: skip
+def test_the_unit_of_each_type_of_iio(
+    sysfs: Callable[..., Path], tmp_path: Path, kind: str, unit: str, value: float
+) -> None:
+    """Documentation/ABI/testing/sysfs-bus-iio: milli °C, gauss, milli percent; the rest as it is."""
+    sysfs(name="one", **{f"in_{kind}_raw": "0", f"in_{kind}_scale": "2"})
+    (channel,) = describe(f"iio:one?root={tmp_path}").channels
+    assert (channel.unit, channel.value(250)) == (unit, pytest.approx(value))
+    assert (channel.bits, channel.signed, channel.is_float) == (32, True, False), "what sysfs gives as text"
+
+
+def test_what_is_a_channel_of_an_iio_device_and_in_which_order(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    scans = {
+        "scan_elements__in_voltage2_index": "0", "scan_elements__in_voltage2_type": "le:u12/16>>4",
+        "scan_elements__in_voltage1_index": "1", "scan_elements__in_voltage1_type": "be:s24/32X2>>8",
+        "scan_elements__in_voltage0_index": "2", "scan_elements__in_voltage0_type": "le:u13/16>>4",
+        "scan_elements__in_accel_x_index": "two", "scan_elements__in_accel_x_type": "le:u12/16>>4",
+        "scan_elements__in_accel_y_index": "3", "scan_elements__in_accel_y_type": "le:u12/24",
+    }  # fmt: skip
+    raws = ("voltage0", "voltage1", "voltage2", "voltage0-voltage1", "accel_x", "accel_y")
+    others = {"in_voltage0_calibbias": "1", "in_temp_label": "board", "out_voltage0_raw": "1", "in_voltage0_scale": "1"}
+    sysfs(name="adc", **{f"in_{name}_raw": "0" for name in raws}, **others, **scans)
+    found = iio_device.find(f"adc?root={tmp_path}")
+    assert [(channel.name, channel.scan) for channel in found.channels] == [
+        ("voltage2", ScanElement(0, "le", False, 12, 16, 4)),
+        ("voltage1", ScanElement(1, "be", True, 24, 32, 8)),
+        ("accel_x", None),
+        ("accel_y", None),
+        ("voltage0-voltage1", None),
+        ("voltage0", None),
+    ], "those of the buffer by their place, then the others by name; a scan that cannot be is none"
+    assert found.character == tmp_path / "dev" / "iio:device0"
+    described = found.describe().channels
+    assert [(part.bits, part.signed) for part in described[:3]] == [(12, False), (24, True), (32, True)]
+
+
+def test_an_iio_device_that_is_not_there_names_those_that_are(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    sysfs("iio:device1", in_temp_raw="0")
+    sysfs("iio:device0", name="adc", in_temp_raw="0")
+    with pytest.raises(NotFoundError) as refused:
+        iio_device.find(f"dac?root={tmp_path}")
+    assert refused.value.hint == "There are: iio:device0 (adc), iio:device1 (no name)."
+    assert iio_device.find(f"iio:device1?root={tmp_path}").name == "iio:device1", "without a name that of its folder"
+    with pytest.raises(NotFoundError, match="There is no IIO device in"):
+        iio_device.find(f"{tmp_path}/none")
+
+
+@pytest.mark.parametrize(
     ("files", "period", "stated"),
     [
         ({"sampling_frequency": "0"}, 0.1, False),
@@ -423,9 +481,10 @@ def edited(folder: Path, *changes: tuple[str, str]) -> Path:
 @pytest.mark.parametrize(
     ("code", "bits", "signed"),
     [
-        ("0x0001", 1, False), ("0x0002", 8, True), ("0x0004", 32, True), ("0x0005", 8, False), ("0x0006", 16, False),
-        ("0x0007", 32, False), ("0x0010", 24, True), ("0x0011", 64, None), ("0x0015", 64, True), ("0x0016", 24, False),
-        ("0x001B", 64, False),
+        ("0x0001", 1, False), ("0x0002", 8, True), ("0x0003", 16, True), ("0x0004", 32, True), ("0x0005", 8, False),
+        ("0x0006", 16, False), ("0x0007", 32, False), ("0x0008", 32, None), ("0x0010", 24, True), ("0x0011", 64, None),
+        ("0x0012", 40, True), ("0x0013", 48, True), ("0x0014", 56, True), ("0x0015", 64, True), ("0x0016", 24, False),
+        ("0x0018", 40, False), ("0x0019", 48, False), ("0x001A", 56, False), ("0x001B", 64, False),
     ],
 )  # fmt: skip
 def test_a_canopen_object_has_the_bits_of_its_data_type(
