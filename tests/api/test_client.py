@@ -359,7 +359,7 @@ class Answered:
     """A connection to the Unix socket that gives one answer; ``failure`` where none is given."""
 
     def __init__(self, status: int, lines: list[bytes], failure: Exception | None = None) -> None:
-        self.status, self._lines, self._failure = status, lines, failure
+        self.status, self._lines, self._failure = status, list(lines), failure
         self.asked: list[tuple[str, str]] = []
         self.closed = 0
 

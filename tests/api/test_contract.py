@@ -56,5 +56,50 @@ def test_the_api_is_what_its_contract_has() -> None:
     assert list(shapes()) == SHAPES.read_text().splitlines()
 
 
+def test_an_operation_is_described_with_all_that_it_takes_and_answers() -> None:
+    """What `shapes.txt` has of each, as a generator of clients reads it."""
+    whole = document()
+    every = ["400", "401", "403", "404", "405", "409", "412", "413", "415", "421", "422", "423", "429", "500", "503"]
+    write, read, update = (
+        whole["paths"][path][method]
+        for path, method in (("/nodes/{uuid}/teds", "put"), ("/nodes/{uuid}/teds", "get"), ("/updates", "post"))
+    )
+    assert [operation["operationId"] for operation in (write, read, update)] == [
+        "putNodesUuidTeds", "getNodesUuidTeds", "postUpdates",
+    ]  # fmt: skip
+    assert [(one["name"], one["in"], one.get("required", False)) for one in write["parameters"]] == [
+        ("uuid", "path", True), ("dry_run", "query", False), ("If-Match", "header", False),
+    ]  # fmt: skip
+    assert sorted(write["responses"]) == ["200", *every]
+    assert sorted(update["responses"]) == ["200", "202", *every]
+    assert update["responses"]["200"] == update["responses"]["202"], "a plan"
+    assert (list(write["responses"]["200"]["content"]), list(read["responses"]["200"]["content"])) == (
+        ["application/json"], ["application/json", "application/xml", "text/plain"],
+    )  # fmt: skip
+    assert all("ETag" in operation["responses"]["200"]["headers"] for operation in (write, read))
+    assert "headers" not in update["responses"]["202"]
+    assert (list(write["requestBody"]["content"]), write["requestBody"]["required"]) == (["application/json"], True)
+    assert update["requestBody"] == {
+        "required": True,
+        "content": {
+            "application/octet-stream": {"schema": {"type": "string", "format": "binary", "maxLength": 4194304}}
+        },
+    }
+    assert "requestBody" not in read
+    number = whole["paths"]["/nodes/{uuid}/channels/{number}"]["put"]["parameters"][1]
+    assert number == {"name": "number", "in": "path", "required": True, "schema": {"type": "integer"}}
+    assert not whole["paths"]["/discover"]["post"]["requestBody"]["required"]
+    assert (whole["openapi"], whole["servers"]) == ("3.1.0", [{"url": "/api/v1"}])
+    assert whole["security"] == [{"token": []}, {"browser": []}]
+    assert whole["components"]["securitySchemes"] == {
+        "token": {"type": "http", "scheme": "bearer"},
+        "browser": {"type": "apiKey", "in": "cookie", "name": "ncap-PORT"},
+    }
+    for code in every:
+        assert write["responses"][code] == {"$ref": f"#/components/responses/{code}"}
+        content = whole["components"]["responses"][code]["content"]
+        assert content == {"application/json": {"schema": {"$ref": "#/components/schemas/Error"}}}
+
+
 if __name__ == "__main__":
     SHAPES.write_text("".join(f"{line}\n" for line in shapes()))

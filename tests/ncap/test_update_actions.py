@@ -359,7 +359,7 @@ def test_a_plan_is_made_in_the_session_of_a_measured_board_and_of_another_one_by
     bench: Bench,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    here, there = object(), SimpleNamespace(interrupts=change.pop("plan", ()))
+    here, there = object(), SimpleNamespace(interrupts=change.get("plan", ()))
     vars(bench).update(change)
     timeouts: list[float] = []
 
@@ -577,3 +577,38 @@ def test_an_update_is_in_the_log_with_what_was_allowed(bench: Bench, monkeypatch
         bench.updates.begin(b"x", UpdateRequest((NODE,)), owner="page")
     assert sorted(path.name for path in (bench.updates._station.home / FOLDER).iterdir()) == before
     assert len(bench.updates.all()) == 3
+
+
+def test_each_board_gets_the_order_that_was_given_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever allowed the image on one board that it does not name did not allow it on the others."""
+    given: list[Any] = []
+
+    def update_at(_station: Any, port: Any, uuid: bytes, order: Any, _reporter: Any, **more: Any) -> BoardUpdate:
+        assert (port, more["timeout"], more["release"]) == (bench.port, 60.0, bench.updates._alone)
+        given.append((uuid.hex(), order.other_board, order.allow_downgrade, order.wait, action.rows[uuid.hex()].state))
+        return BoardUpdate(uuid, "updated", "1.0.0", 1, 1.0)
+
+    monkeypatch.setattr(updates, "update_at", update_at)
+    action = bench.action(BoardRow(NODE), BoardRow(OTHER))
+    action.request = UpdateRequest((NODE, OTHER), frozenset({OTHER}), allow_downgrade=True, wait=9.0)
+    image = cast(Any, object())
+    assert [bench.updates._update(action, image, uuid).result for uuid in (NODE, OTHER)] == ["updated", "updated"]
+    assert given == [(NODE, False, True, 9.0, "running"), (OTHER, True, True, 9.0, "running")]
+    [kept] = UpdateFolder(bench.updates._station.home).read()
+    assert [row.state for row in kept.rows.values()] == ["running", "running"], "a restart finds it so"
+    bench.whitelisted = False
+    refused = bench.updates._update(action, image, NODE)
+    assert (refused.result, refused.before, refused.error and refused.error.code) == ("refused", None, "refused")
+    assert len(given) == 2
+
+
+def test_without_an_image_or_a_package_nothing_is_planned(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(BadDataError) as refused:
+        updates._image_of(b"")
+    assert refused.value.message == "The request contains no image."
+    assert refused.value.hint == "Send the file that imgtool sign wrote as the body."
+    for missing in ("imgtool", "smp"):
+        monkeypatch.setattr(updates, "is_installed", lambda module, missing=missing: module != missing)
+        with pytest.raises(NotFoundError, match=f"Firmware updates need the package {missing}") as needed:
+            updates._image_of(b"x")
+        assert "[update]" in needed.value.hint
