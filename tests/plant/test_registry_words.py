@@ -8,23 +8,29 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from teds_provision import plant
 from teds_provision.cli.rendering import local_time
+from teds_provision.errors import BadDataError
+from teds_provision.plant import schema
+from teds_provision.plant.commands import parcels as of_parcels
 from teds_provision.plant.commands import registry as commands
 from teds_provision.plant.removed_members import RemovalReview
 from teds_provision.plant.status import PlantStatus, StationStanding
 from teds_provision.plant.sync import SyncResult
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share
 from teds_provision.station.plant.alarms import Alarm
+from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
+from tests.bench import PASSPHRASE
 from tests.cli.shell import call
 
-from .owner import REGISTRY, alone
+from .owner import ALL, REGISTRY, alone, join, member, roster_of
 
 AT = "2026-01-31T12:00:00Z"
 END = datetime(2026, 3, 1, 12, 30, 5, tzinfo=UTC)
@@ -328,3 +334,126 @@ def test_a_roster_that_says_the_same_is_not_signed_again(home: Path, tmp_path: P
     signed = call(home, "registry", "role", "owner", "keeper", "--yes")
     assert signed.out == "Roster 2 is in force here. To tell the others: teds-provision registry sync\n"
     assert isinstance(held, Roster)
+
+
+def of_a_plant(home: Path, *removed: RemovedMember) -> Roster:
+    """Have a roster in force that names this station, and west, and these as removed."""
+    with Station.inspect(home) as station:
+        station.ask_by(lambda *_: PASSPHRASE)
+        station.unlock()
+        west = SoftwareKey(91)
+        named = Member("west", west.point, station.identity.certify(west.point), frozenset({"line"}))
+        now = roster_of(station, member(station, "owner", *ALL), named, version=2, previous="0" * 64, removed=removed)
+        join(station, now)
+    return now
+
+
+def gone(number: int, name: str) -> RemovedMember:
+    return RemovedMember(name, SoftwareKey(number).point, frozenset({"line"}), "lost", (0, ""))
+
+
+def test_the_sql_of_each_option(home: Path) -> None:
+    lost, old = gone(92, "lost"), gone(93, "old")
+    held = of_a_plant(home, lost, old)
+    west = fingerprint(SoftwareKey(91).point)
+
+    def sql(*words: object) -> str:
+        return call(home, "registry", "sql", *words).out
+
+    whole = schema.registry_sql(held.registry)
+    both = "".join(schema.close_sql(fingerprint(left.point)) for left in held.removed)
+    assert (len(held.removed), sql()) == (2, (whole + both).rstrip("\n") + "\n"), "a restore opens every login again"
+    for name, digits in (("west", west), ("old", fingerprint(old.point))):
+        assert sql("--close", name) == schema.close_sql(digits).rstrip("\n") + "\n"
+        assert sql("--mend", name, "1") == schema.mend_sql(digits, 1).rstrip("\n") + "\n"
+    for words, code in ((("--close", "nobody"), 3), (("--mend", "west", "x"), 2), (("--mend", "west", "-1"), 2),
+                        (("--mend", "west", "12345678901"), 2), (("--mend", "west", "0"), 8)):  # fmt: skip
+        assert call(home, "registry", "sql", *words).code == code
+
+
+def test_a_station_belongs_to_one_registry_and_is_asked_once(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = of_a_plant(home)
+    past: list[object] = []
+    monkeypatch.setattr(plant.backlog, "backlog", lambda _station: past.append(1) or [])
+    monkeypatch.setattr(plant.membership, "found_roster", lambda *_: held)
+    again = call(home, "registry", "connect", "--files", tmp_path)
+    assert (again.code, again.out, past) == (0, "Joined plant. Next: teds-provision registry sync\n", [])
+    other = replace(held, registry="11111111-2222-4333-8444-555555555555")
+    monkeypatch.setattr(plant.membership, "found_roster", lambda *_: other)
+    refused = call(home, "registry", "connect", "--files", tmp_path, "--yes")
+    assert (refused.code, f"already belongs to registry {REGISTRY}." in refused.err) == (6, True)
+    assert call(home, "registry", "disconnect", "--yes").code == 0
+    assert call(home, "registry", "connect", "--files", tmp_path).code == 6, "nobody answers the question"
+    assert past == [1]
+    with Station.inspect(home) as station:
+        assert station.plant.joined is None
+
+
+def firmware(text: str, by: str, version: str | None = "1.2.3", build: int | None = 0) -> dict[str, Any]:
+    return {"text": text, "version": version, "build": build, "image": "ab" * 32, "by": by, "at": AT}
+
+
+def test_a_node_as_the_plant_reports_it(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    says: dict[str, Any] = {
+        "epoch": 3, "holders": {"k1": ["north", "south"], "k2": ["west"]}, "sequence": 9, "written_by": "north",
+        "older_than": "north", "revoked": ["west", "east"], "firmware": firmware("cell", "north", build=7),
+        "firmware_by": {"north": firmware("cell", "north", build=7), "south": firmware("cell", "south", build=7),
+                        "east": firmware("cell", "east", build=6), "west": firmware("", "west")},
+    }  # fmt: skip
+    bare = {"epoch": None, "holders": {}, "sequence": None, "written_by": None, "older_than": None, "revoked": [],
+            "firmware": firmware("", "north", None, None), "firmware_by": {}}  # fmt: skip
+    found = [
+        {"uuid": "8d" * 10, "name": "left knee", "says": says, "conflicts": [
+            {"name": "two keys", "why": "a and b"}, {"name": "other pin", "why": "c"}]},
+        {"uuid": "8e" * 10, "name": None, "says": bare, "conflicts": []},
+    ]  # fmt: skip
+    monkeypatch.setattr(plant.status, "nodes", lambda _station, _roster, _text: iter(found))
+    at = local_time(AT)
+    assert call(home, "nodes", "--plant").out.splitlines() == [
+        f"{'8d' * 10}  left knee  held by north, south, west (epoch 3), datasheet 9 by north, "
+        f"firmware cell 1.2.3+7 (north, {at}), revoked by west, east",
+        "  the datasheet known here is older than north wrote",
+        "  two keys: a and b",
+        "  other pin: c",
+        f"  also reported: firmware cell 1.2.3+6 (east, {at})",
+        f"  also reported: firmware 1.2.3 (west, {at})",
+        f"{'8e' * 10}  no holder, firmware not reported (north, {at})",
+    ]
+    assert call(home, "--json", "nodes", "--plant").json == {"nodes": found}
+
+
+def test_each_parcel_that_waits_is_shown_with_its_reason_and_taken_in(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [("bad", "bundle", "waiting", "a move"), ("job", "job", "waiting", ""), ("late", "bundle", "later", "pages"),
+            ("new", "bundle", "later", ""), ("sent", "bundle", "sent", "")]  # fmt: skip
+    with Station.inspect(home) as station:
+        for name, kind, state, why in rows:
+            way: Any = "out" if state == "sent" else "in"
+            row = ParcelRow(name, way, WEST, cast("Any", kind), cast("Any", state), "2099-01-01T00:00:00Z", "", why)
+            station.plant.parcels.put(row, name.encode())
+
+    def plan_import(_station: Station, octets: bytes) -> Any:
+        if octets == b"bad":
+            raise BadDataError("It is none.")
+        return octets
+
+    taken: list[str] = []
+    monkeypatch.setattr(of_parcels, "plan_import", plan_import)
+    monkeypatch.setattr(of_parcels, "require_as_shown", lambda *_: None)
+    monkeypatch.setattr(of_parcels, "import_text", lambda _station, shown: f"Plan of {shown.decode()}.")
+    monkeypatch.setattr(of_parcels, "import_plan", lambda shown: {"count": 1})
+    done = SimpleNamespace(fresh=True)
+    monkeypatch.setattr(plant.parcels, "import_parcel", lambda _station, row, _plan: taken.append(row.id) or done)
+    shown = ["Warning: bad: It is none.", "Plan of late.", "Reason for waiting: pages", "Plan of new.",
+             "Reason for waiting: it has just arrived"]  # fmt: skip
+    plan = call(home, "import-keys", "--received", "--dry-run")
+    assert (plan.err.splitlines(), plan.out, taken) == (shown, "2 parcels.\n", [])
+    assert call(home, "import-keys", "--received").code == 6
+    assert taken == []
+    assert call(home, "import-keys", "--received", "--yes").out == (
+        "2 parcels imported; the receipts leave with the next sync.\n"
+    )
+    assert taken == ["late", "new"]
