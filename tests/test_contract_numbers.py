@@ -115,6 +115,15 @@ def test_the_numbers_of_the_contract() -> None:
 
 def test_the_numbers_of_the_guides() -> None:
     numbers: dict[str, tuple[object, object]] = {
+        # docs/batch.md
+        "what each link bears": (
+            (ports.NFC, ports.CAN, ports.BLE),
+            (
+                ports.Capabilities(True, False, False, False, False, False, False, 1, 2000),
+                ports.Capabilities(False, True, True, True, True, True, True, 24, 24_000),
+                ports.Capabilities(False, False, True, False, False, False, True, 1, 8000),
+            ),
+        ),
         # docs/recording.md
         "a part has 1 GiB": (files.LARGEST_PART, 1_073_741_824),
         "values are in the file, then on the disk": ((files.FLUSH, files.SYNC), (0.1, 1.0)),
@@ -173,7 +182,7 @@ def test_the_numbers_of_the_guides() -> None:
 def test_the_numbers_of_stores_vaults_and_handovers() -> None:
     numbers: dict[str, tuple[object, object]] = {
         # docs/store.md
-        "a check reads a sample": ((row_sample.SAMPLED, row_sample._NEWEST), (5000, 500)),
+        "a check reads a sample": ((row_sample.SAMPLED, row_sample._NEWEST, row_sample._RUN), (5000, 500, 20)),
         "keys that wait for their proof": (node_keys.MAX_PENDING, 8),
         "a Confirm may be late": (node_keys.CONFIRM_MAY_ARRIVE, timedelta(minutes=2)),
         "the present datasheet and ten older ones": (datasheets.KEPT, 11),

@@ -25,7 +25,7 @@ from teds_provision.station.store.records import (
 )
 from tests.bench import copied_station
 
-A, B, C = (bytes.fromhex(f"8d4d9da65281f700000{number}") for number in (1, 2, 3))
+A, B, C, D = (bytes.fromhex(f"8d4d9da65281f700000{number}") for number in (1, 2, 3, 4))
 POINT = SoftwareKey(71).point
 PIN = fingerprint(POINT)
 SENDER, OTHER = "aa" * 32, "bb" * 32
@@ -102,6 +102,63 @@ def test_a_node_that_comes_back_is_rotated_and_its_tombstone_goes(station: Stati
     assert (station.keys.rotation_due(A) or "").startswith(word)
     assert (station.keys.rotation_due(B) is not None) is (mode == "move")
     assert station.policy.tombstones() == []
+
+
+def test_a_node_joins_the_groups_of_its_bundle_and_leaves_none(station: Station) -> None:
+    station.groups.create("arm", [C])
+    station.groups.create("own", [A])
+    take(
+        station,
+        PlannedNode(node(A, groups=("arm", "hand")), "new"),
+        PlannedNode(node(B, groups=("hand", "all")), "same"),
+    )
+    groups = {group.name: sorted(group.uuids) for group in station.groups.all()}
+    assert groups == {"arm": [A, C], "own": [A], "hand": [A, B], "group all": [B]}, "all is the name of no group"
+
+
+@pytest.mark.parametrize("mode", ["copy", "move"])
+def test_whose_ca_a_node_keeps_is_noted_beside_its_rotation(station: Station, mode: str) -> None:
+    other = SoftwareKey(75).point
+    own = bundle(station, mode)
+    own.ca = other
+    station.keys.add(KeyRecord(B, 2, "01" * 8, "active", 1, b"wrapped", "agreement", AT))
+    station.keys.set_ca_of(D, other)
+    newer = node(B, 5)
+    planned = (
+        PlannedNode(node(A), "new"), PlannedNode(newer, "newer"), PlannedNode(node(C), "same"),
+        PlannedNode(node(D), "new"),
+    )  # fmt: skip
+    with station.transaction():
+        ImportedRows(station, own).take_in(planned)
+    flags = {uuid: station.keys._flags(uuid) for uuid in (A, B, C, D)}
+    assert [flags[uuid].ca for uuid in (A, B, C, D)] == [other, None, None, other]
+    assert (flags[B].next_key_id, flags[B].next_ca) == (newer.kid, other), "once a session proves the key"
+    assert {flags[uuid].next_key_id for uuid in (A, C, D)} == {None}
+    due = {(flags[uuid].rotation or "").startswith("moved here by h") for uuid in (A, B, C, D)}
+    assert due == {mode == "move"}
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("8d4d", "8d4d-0001"), ("FACE", "FACE-0001"), ("0X8d4d", "0X8d4d-0001"), ("8d4", "8d4"), ("8d4g", "8d4g"),
+        ("8d4d 2", "8d4d 2"), ("palm", "palm-0001"), ("thumb", "thumb"), ("0x8", "0x8"), (None, None),
+    ],
+)  # fmt: skip
+def test_a_name_is_no_other_nodes_and_looks_like_no_uuid(station: Station, name: str | None, shown: str | None) -> None:
+    station.nodes.put(NodeRecord(C, name="palm"))
+    station.nodes.put(NodeRecord(B, name="own name"))
+    judge = _Judge(station, (), bundle(station))
+    first, second = judge.judge_nodes([node(A, name=name), node(B, name=name)])
+    assert (first.name, second.name) == (shown, "own name"), "a name that was given here stays"
+    why = f"it is called {shown} here: {name} is the name of another node, or like a UUID"
+    assert (first.notes, second.notes) == ((why,) if shown != name else (), ())
+
+
+def test_two_nodes_of_a_bundle_have_two_names(station: Station) -> None:
+    judge = _Judge(station, (), bundle(station))
+    names = [planned.name for planned in judge.judge_nodes([node(A, name="palm"), node(B, name="palm")])]
+    assert names == ["palm", "palm-0002"]
 
 
 def judged(

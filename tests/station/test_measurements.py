@@ -87,6 +87,52 @@ def test_a_node_in_the_place_of_another_has_its_names_and_frames_and_keeps_its_o
     assert names.frames == {(THREE, 1): "hook frame"}
 
 
+def test_measurements_go_on_with_the_spare_or_without_the_node_and_end_without_any(station: Station) -> None:
+    station.groups.put(Group("alone", (ONE,)))
+    station.groups.put(Group("both", (ONE, TWO)))
+    station.groups.put(Group("others", (TWO, THREE)))
+    kept = [
+        KeptMeasurement("m1", uuids=(THREE, ONE, TWO)), KeptMeasurement("m2", uuids=(ONE,)),
+        KeptMeasurement("m3", uuids=(TWO,)), KeptMeasurement("m4", match="type:cell"),
+        KeptMeasurement("m5", group="alone"), KeptMeasurement("m6", group="both"),
+        KeptMeasurement("m7", group="others"),
+    ]  # fmt: skip
+    for one in kept:
+        station.measurements.keep(one)
+
+    def of() -> dict[str, tuple[bytes, ...]]:
+        return {one.id: one.uuids for one in station.measurements.all() if one.uuids}
+
+    done = station.measurements.hand_on(ONE, TWO)
+    assert (done.groups, done.measurements, done.ended) == (("alone", "both"), ("m1", "m2", "m5", "m6"), ())
+    assert of() == {"m1": (THREE, TWO), "m2": (TWO,), "m3": (TWO,)}, "no node twice"
+    again = station.measurements.hand_on(ONE, TWO)
+    assert (again.groups, again.measurements, again.ended) == ((), (), ())
+    gone = station.measurements.hand_on(TWO, None)
+    assert (gone.measurements, gone.ended) == (("m1", "m7"), ("m2", "m3", "m5", "m6"))
+    assert of() == {"m1": (THREE,)}
+    assert [one.id for one in station.measurements.all()] == ["m1", "m4", "m7"]
+    assert [(group.name, group.uuids) for group in station.groups.all()] == [
+        ("alone", ()), ("both", ()), ("others", (THREE,))
+    ]  # fmt: skip
+
+
+def test_a_command_that_measures_the_old_node_is_named(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    station.groups.put(Group("hand", (ONE, THREE)))
+    running = [
+        KeptMeasurement("c1", uuids=(TWO, ONE), owner="command", pid=41),
+        KeptMeasurement("c2", uuids=(TWO,), owner="command", pid=42),
+        KeptMeasurement("c3", group="hand", owner="command", pid=43),
+        KeptMeasurement("c4", group="none", owner="command", pid=44),
+    ]
+    monkeypatch.setattr(station.measurements, "of_commands", lambda: running)
+    assert station.measurements.hand_on(ONE, TWO).kept == (
+        f"The running command measure {ONE.hex()} (process 41) goes on with the old node until it is started again.",
+        "The running command measure hand (process 43) goes on with the old node until it is started again.",
+    )
+    assert station.measurements.hand_on(bytes(10), TWO).kept == ()
+
+
 def test_how_nodes_are_detected_is_kept(station: Station, home: Path) -> None:
     assert station.measurements.detection == "whitelist"
     modes: tuple[DetectionMode, ...] = ("transparent", "whitelist")
