@@ -24,7 +24,7 @@ from teds_provision.vault.pkcs11_token import ask_pin
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station
-from tests.cli.shell import Outcome, clean_environment, spawn
+from tests.cli.shell import Outcome, call, clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload
 
 NODE = "0102030405060708090a"
@@ -259,6 +259,27 @@ def test_a_token_is_asked_for_its_pin_once(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("span", ["", "15", "0m", "13h", "soon"])
 def test_a_span_that_is_none_is_usage(home: Path, span: str) -> None:
     assert run(home, "unlock", "--for", span, passphrase=PASSPHRASE).code == 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "file", "token"),
+    [(b"Fkey", b"key", None), (b"P1234", None, b"1234"), (b"F", None, None), (b"", None, None), (b"Xkey", None, None)],
+)
+def test_what_is_held_opens_a_vault_of_its_kind_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: bytes, file: bytes | None, token: bytes | None
+) -> None:
+    monkeypatch.setattr(agent, "_ask", lambda *_: answer)
+    assert (agent.held(tmp_path, "file"), agent.held(tmp_path, "pkcs11")) == (file, token)
+
+
+@pytest.mark.parametrize(("span", "seconds"), [("12h", 43_200), ("1s", 1), ("90s", 90), (None, 900), ("43201s", None)])
+def test_a_vault_is_held_open_from_a_second_to_twelve_hours_and_15_minutes_by_default(
+    home: Path, monkeypatch: pytest.MonkeyPatch, span: str | None, seconds: int | None
+) -> None:
+    begun: list[int] = []
+    monkeypatch.setattr(agent, "start", lambda _home, _kind, _secret, seconds: begun.append(seconds))
+    done = call(home, "unlock", *(() if span is None else ("--for", span)))
+    assert (done.code, begun) == ((2, []) if seconds is None else (0, [seconds]))
 
 
 def page_with(secret: bytes) -> agent.LockedPage:

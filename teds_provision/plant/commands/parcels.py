@@ -86,7 +86,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
     plant.apply_pages.require_roster(station)
     station.unlock()
     parcels, results = station.plant.parcels, list[dict[str, Any]]()
-    for row in parcels.all("in", "waiting"):
+    for row in parcels.all("in", "waiting", "later"):
         if row.kind != "bundle":
             continue
         octets = parcels.document(row.id, "in")
