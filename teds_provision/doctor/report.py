@@ -72,7 +72,7 @@ def _names_of_stations(system: System) -> dict[str, str]:
         return {}
     try:
         with Station.inspect(system.home) as station:
-            names = {record.name for record in station.policy.listed()}
+            names = {record.name for record in station.policy.listed()} | {station.name}
             roster = station.plant.roster
     except TedsProvisionError:  # the checks report why
         return {}

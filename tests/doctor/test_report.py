@@ -17,6 +17,7 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.plant.roster import Member, RemovedMember
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import TrustRecord
+from tests.bench import make_station
 from tests.cli.shell import call
 from tests.plant.owner import ALL, alone, join, member, roster_of
 
@@ -136,3 +137,11 @@ def test_names_of_the_plant_and_of_stations_are_gone(tmp_path: Path) -> None:
         "PLANT: roster 2 holds. STATION-4 has dated its page; STATION-1, STATION-3 and STATION-2 have not. Westward.",
         "Set the clock of STATION-4.",
     )
+
+
+def test_the_name_of_a_station_alone_is_gone(tmp_path: Path) -> None:
+    make_station(tmp_path / "home", "crane-7").close()
+    mask = Mask(System(tmp_path / "home"), with_uuids=True)
+    assert mask("crane-7 and crane-78") == "STATION-1 and crane-78"
+    (tmp_path / "home" / "store.sqlite3").write_bytes(b"no database")
+    assert Mask(System(tmp_path / "home"), with_uuids=True)("crane-7") == "crane-7", "its name cannot be read"

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from teds_provision.errors import BadDataError
 from teds_provision.provisioning import build as step
 from teds_provision.provisioning.build import (
     BuildOrder,
@@ -221,3 +222,104 @@ def test_a_trial_build_changes_no_facts_of_a_node_that_has_a_datasheet(
     draft = station.datasheets.draft(UUID)
     assert draft is not None
     assert (draft.stage, draft.profile, draft.image.security) == ("built", FINGER, b"unsigned")
+
+
+# -- what is brought back, and what stays ------------------------------------------------------------------------------
+
+KEPT = [Image(UUID, {(0, 1): bytes([number]), SECURITY: b"old"}) for number in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({}, 2),  # an older one, if the node was signed for that
+        ({"verdicts": ["not authentic"]}, None),
+        ({"signed_for": b"unknown"}, None),
+        ({"signed": False}, None),
+        ({"security": None}, None),
+        ({"security": b"cut"}, None),
+        ({"order": BuildOrder(FINGER)}, None),
+        ({"order": BuildOrder(name="a")}, None),
+        ({"order": BuildOrder(drop_calibration=True)}, None),
+    ],
+)
+def test_an_altered_node_gets_the_datasheet_back_that_it_was_signed_for(
+    station: Station, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], found: int | None
+) -> None:
+    how = {"order": BuildOrder(), "security": b"now", "signed": True, "signed_for": bytes([2]),
+           "verdicts": ["authentic"]} | change  # fmt: skip
+    judged: list[Image] = []
+
+    def decode(octets: bytes) -> Any:
+        if octets == b"cut":
+            raise BadDataError("It is cut.")
+        return SimpleNamespace(signed=how["signed"], signed_blocks={(0, 1): how["signed_for"]})
+
+    def verify_image(_station: Station, image: Image, *, floor: object) -> list[str]:
+        assert floor == "floor of now"
+        judged.append(image)
+        return [how["verdicts"][0]]
+
+    history = [SimpleNamespace(image=image) for image in KEPT]
+    monkeypatch.setattr(type(station.datasheets), "history", lambda *_: history)
+    monkeypatch.setattr(step.security, "decode", decode)
+    monkeypatch.setattr(step.datasheet, "digests", dict)
+    monkeypatch.setattr(step, "verify_image", verify_image)
+    monkeypatch.setattr(step, "FreshnessFloor", lambda identity: f"floor of {identity}")
+    monkeypatch.setattr(step, "Verification", lambda _uuid, checks: SimpleNamespace(verdict=checks[0]))
+    blocks = {(0, 1): b"altered"} | ({SECURITY: how["security"]} if how["security"] else {})
+    present: Any = SimpleNamespace(image=Image(UUID, blocks), identity="now")
+    proposal = step._mended(station, PreparedOrder(how["order"]), present)
+    if found is None:
+        assert proposal is None
+        return
+    assert proposal == Proposal(Image(UUID, {(0, 1): bytes([found])}), (), named=True)
+    assert judged == [Image(UUID, {(0, 1): bytes([found]), SECURITY: b"now"})], "under the signature that it has"
+
+
+@pytest.mark.parametrize(
+    ("drafted", "stays"), [(None, True), ({(0, 1): b"a", (1, 3): b"fixed"}, True), ({(0, 1): b"b"}, False)]
+)
+def test_what_was_built_and_never_written_is_no_part_of_what_stays_without_a_yes(
+    station: Station, drafted: Any, stays: bool
+) -> None:
+    has = Image(UUID, {(0, 1): b"a", (1, 3): b"fixed", SECURITY: b"s"})
+    wanted = Image(UUID, {(0, 1): b"a", (1, 3): b"fixed"})
+    present: Any = SimpleNamespace(image=has, fixed_beside=lambda blocks: {(1, 3): b"fixed"})
+    if drafted is not None:
+        station.datasheets.keep_draft(Draft(UUID, Image(UUID, drafted), "built", "load-cell"))
+    found = step._as_it_is(station, present)
+    if stays:
+        assert (found.image, found.named, found.profile) == (wanted, True, None)
+        assert step.unwritten_draft(station, has, wanted) == ()
+        return
+    assert found.image == Image(UUID, {(0, 1): b"b", (1, 3): b"fixed"})
+    assert (found.named, found.profile) == (False, "load-cell")
+    (warning,) = step.unwritten_draft(station, has, wanted)
+    assert warning.startswith(f"Node {UUID.hex()} has a draft (built as load-cell) that was never written; it is kept")
+
+
+def test_of_a_datasheet_that_stays_those_teds_alone_change_that_are_named(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = {(0, 1): b"same", (0, 12): b"name", (1, 3): b"new", (1, 12): b"new", (2, 5): b"added"}
+    unasked = {(0, 1): b"same", (0, 12): b"name", (1, 3): b"old", (1, 12): b"old", (1, 5): b"gone"}
+
+    def compose(_station: Station, _uuid: bytes, prepared: PreparedOrder, *_: object, **more: Any) -> Any:
+        assert more == {"name": None, "as_known": False}
+        blocks = unasked if prepared.order == BuildOrder() else asked
+        return SimpleNamespace(blocks=blocks, profile="p", warnings=("w",), wanted="p", name="n", calibrations={1: "c"})
+
+    monkeypatch.setattr(step, "compose", compose)
+    monkeypatch.setattr(step, "own_name", lambda *_: None)
+    has = {(0, 1): b"own", (0, 12): b"own", (1, 3): b"own", (1, 5): b"own", (1, 12): b"fixed", (3, 3): b"own"}
+    present: Any = SimpleNamespace(
+        image=Image(UUID, {**has, SECURITY: b"s"}), is_read_only=lambda block: block == (1, 12)
+    )
+    for name in (None, "name"):
+        found = step._only_what_is_named(station, PreparedOrder(BuildOrder(FINGER, name=name)), present)
+        assert found.image.blocks == {
+            (0, 1): b"own", (0, 12): b"name" if name else b"own", (1, 3): b"new", (1, 12): b"fixed",
+            (2, 5): b"added", (3, 3): b"own",
+        }  # fmt: skip
+        assert (found.named, found.warnings, found.profile_digest) == (True, ("w",), None)
