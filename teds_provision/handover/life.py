@@ -12,10 +12,10 @@ from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.handover.strict_json import is_label
 from teds_provision.provisioning.agree import ResetReceipt
 from teds_provision.provisioning.board_type import WrongBoardError, differences
-from teds_provision.provisioning.build import BuildOrder, build
+from teds_provision.provisioning.build import BuildOrder, build, pending_image
 from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import NodeRecord, RevocationRecord
+from teds_provision.station.store.records import Draft, NodeRecord, RevocationRecord
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
@@ -99,11 +99,25 @@ def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: 
 
 @dataclass(frozen=True)
 class TakeoverPlan:
-    """Data that a spare takes over; ``calibration`` counts the channels whose calibration goes along."""
+    """Data that a spare takes over; ``calibration`` counts the channels whose calibration goes along.
+
+    ``draft`` is what was built for the spare and never written: it is dropped.
+    """
 
     old: NodeRecord
     new: NodeRecord
     calibration: dict[BlockId, bytes]
+    draft: Draft | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence about the draft that is dropped, if there is one."""
+        if self.draft is None:
+            return ()
+        profile = f" as {self.draft.profile}" if self.draft.profile else ""
+        return (
+            f"The draft of node {self.new.uuid.hex()} ({self.draft.stage}{profile}) was never written; it is dropped.",
+        )
 
     @property
     def done(self) -> bool:
@@ -128,6 +142,8 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     plan = TakeoverPlan(before, after, _calibration_of(station, before) if copy_calibration else {})
     if not plan.done:
         _require_same_type(station, old, new)
+        if pending_image(station, new, station.datasheets.datasheet(new)) is not None:
+            return replace(plan, draft=station.datasheets.draft(new))
     return plan
 
 
@@ -179,7 +195,7 @@ def take_over(station: Station, plan: TakeoverPlan, receipt: ResetReceipt | None
     Returns warnings (with a calibration the spare's datasheet is built, to be signed and written), and what it moved.
     """
     old, new = plan.old, plan.new.uuid
-    warnings: tuple[str, ...] = ()
+    warnings = plan.warnings
     with station.transaction():
         moved = station.measurements.hand_on(old.uuid, new)
         if not plan.done:
@@ -191,7 +207,7 @@ def take_over(station: Station, plan: TakeoverPlan, receipt: ResetReceipt | None
             station.nodes.remember(new, name=old.name, profile=old.profile)
             if plan.calibration:
                 order = BuildOrder(old.profile, name=old.name)
-                warnings = build(station, new, order, has=Image(new, plan.calibration)).warnings
+                warnings += build(station, new, order, has=Image(new, plan.calibration)).warnings
             detail = {name: values for name, values in moved.to_json().items() if values}
             station.audit("replace", new, "done", old=old.uuid.hex(), calibration=bool(plan.calibration), **detail)
         else:

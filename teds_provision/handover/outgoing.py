@@ -107,6 +107,17 @@ class Selection:
         """Return those of the named nodes that can be exported."""
         return [self.keys[uuid] for uuid in sorted(set(self.order.nodes or ())) if not self._obstacle(uuid)]
 
+    def why_outdated(self, uuid: bytes, key_id: str) -> str:
+        """Return why this key, which is in a bundle that was made earlier, must not leave now; "" if it may.
+
+        The key of a move rests: nothing can rotate it here, and its receiver does so at once.
+        """
+        if self.order.mode == "move":
+            held = uuid in self.keys
+            return "it is revoked" if uuid in self.revoked else "" if held else "this station holds no key for it"
+        why = self._obstacle(uuid)
+        return why if why or self.keys[uuid].key_id == key_id else "its key was replaced since"
+
     def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
         """Return the nodes that were named; raises PolicyError if one cannot go."""
         why = {uuid: self._obstacle(uuid) for uuid in sorted(set(nodes))}
@@ -175,6 +186,18 @@ class Selection:
         rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
         together = _of_the_last_run([BundleNotes.from_json(row.nodes) for row in rows])
         return sorted(bytes.fromhex(uuid) for notes in together for uuid in notes.uuids)
+
+
+def why_outdated(station: Station, row: Handover) -> tuple[bytes, str] | None:
+    """Return the first node of a bundle that no export would include now with that key, and why; None if all go.
+
+    For a bundle that was sealed and has not left: a node may have been revoked since, or its key rotated.
+    """
+    notes = BundleNotes.from_json(row.nodes)
+    uuids = tuple(bytes.fromhex(uuid) for uuid in notes.uuids)
+    selection = Selection(station, ExportOrder(row.peers, uuids, row.mode), set(row.peers))
+    found = ((uuid, selection.why_outdated(uuid, key)) for uuid, key in zip(uuids, notes.keys, strict=False))
+    return next(((uuid, why) for uuid, why in found if why), None)
 
 
 def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[bytes, str, int, str]]:

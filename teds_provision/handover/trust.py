@@ -516,7 +516,7 @@ def remove(station: Station, record: TrustRecord) -> Removal:
     """Trust a key no more, and end all that hung on it, in one transaction (see :class:`Removal`)."""
     with station.transaction():
         removal = plan_removal(station, record)
-        station.policy.distrust(record.fingerprint if record.role == "station" else record.name)
+        station.policy.distrust(record.name)  # this row alone: its key may also be trusted in the other role
         for uuid in removal.shared:
             station.keys.demand_rotation(uuid, f"station {record.name} is no longer trusted, and holds this key")
         for ca in removal.cas:

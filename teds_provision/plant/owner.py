@@ -36,6 +36,7 @@ from teds_provision.protocol.plant.roster import (
 )
 from teds_provision.station.station import Station
 
+_SAME_END = timedelta(hours=1)
 FIRST_ROLES: frozenset[Role] = frozenset({"keeper", "sign", "line", "base"})
 
 
@@ -221,6 +222,11 @@ def renewed(station: Station, days: timedelta, *, redate: bool = False) -> Roste
     if redate:
         return replace(following(station, expires=moment + days), created=moment)
     return following(station, expires=max(moment, require_roster(station).created) + days)
+
+
+def same_end(held: Roster, draft: Roster) -> Roster:
+    """Return a renewal with the end that the roster has now if that is less than an hour sooner: it was run before."""
+    return replace(draft, expires=held.expires) if held.expires <= draft.expires < held.expires + _SAME_END else draft
 
 
 def is_ahead(held: Roster) -> bool:

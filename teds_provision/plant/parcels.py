@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from itertools import chain
+from shlex import quote
 from typing import Final
 from uuid import uuid4
 
@@ -35,7 +36,7 @@ from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
 from teds_provision.station.station import Station
 from teds_provision.station.store.database import chunks
-from teds_provision.station.store.records import TrustRecord
+from teds_provision.station.store.records import Handover, TrustRecord
 
 NODES: Final = 10_000
 """So many nodes go into one copy."""
@@ -347,7 +348,7 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime, *, b
 
 @dataclass(frozen=True)
 class SentParcels:
-    """Number of parcels that left in a sync, and a sentence for each receiver whose parcels are held back."""
+    """Number of parcels that left in a sync, and sentences about those that are held back or were dropped."""
 
     count: int
     held_back: tuple[str, ...] = ()
@@ -360,10 +361,12 @@ def send_out(station: Station, transport: Transport, views: Views, now: datetime
         return SentParcels(0)
     _expire(station, now)
     _note_refused(station)
+    dropped = _drop_outdated(station, roster)
     if now < roster.expires:
         _make_copies(station, roster, views, now)
         _forget(station, roster, views)
-    return _send(station, roster, transport, now)
+    sent = _send(station, roster, transport, now)
+    return replace(sent, held_back=(*dropped, *sent.held_back))
 
 
 def waiting_out(station: Station) -> int:
@@ -416,7 +419,12 @@ def _why_held_back(station: Station, roster: Roster, row: ParcelRow, now: dateti
     if roster.member(row.peer) is None:
         return f"{name} is no member any more; to take back a move to it: handover undo ID"
     handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
-    if handover is None or handover.mode != "copy":
+    if handover is None:
+        return ""
+    outdated = outgoing.why_outdated(station, handover)
+    if outdated is not None:
+        return _why_outdated(name, handover, *outdated)
+    if handover.mode != "copy":
         return ""
     if now >= roster.expires:
         return f"keys for {name}, as the roster expired on {roster.expires:%Y-%m-%d}; ask its owner: registry renew"
@@ -424,6 +432,40 @@ def _why_held_back(station: Station, roster: Roster, row: ParcelRow, now: dateti
     if row.detail == _BY_SHARE and next(shares, None) is None:
         return f"keys for {name}, as no share of the roster sends them there any more"
     return ""
+
+
+def _why_outdated(name: str, handover: Handover, uuid: bytes, why: str) -> str:
+    node = f"keys for {name}, because of node {uuid.hex()}: {why}"
+    if handover.mode == "move":
+        return f"{node}. Take the move back, then move the others: handover undo {handover.id}"
+    return f"{node}. To send what may still go: export-keys --to {quote(name)} UUID --send"
+
+
+def _drop_outdated(station: Station, roster: Roster) -> tuple[str, ...]:
+    """Drop parcels that must not leave any more: a move that was undone; a share's copy with a key that is outdated.
+
+    The share then makes another copy, of what may still go. A copy that a person ordered is held back instead.
+    """
+    parcels, dropped = station.plant.parcels, list[str]()
+    for row in parcels.all("out", "ready"):
+        handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
+        if handover is None:
+            continue
+        name, outdated = roster.name_of(row.peer), None
+        if handover.state == pending.UNDONE:
+            why = f"keys for {name}, as the move {handover.id} was undone"
+        elif row.detail == _BY_SHARE and (outdated := outgoing.why_outdated(station, handover)) is not None:
+            why = (
+                f"keys for {name}, because of node {outdated[0].hex()}: {outdated[1]}; a new copy has what may still go"
+            )
+        else:
+            continue
+        with station.durable(_COMMAND):
+            parcels.forget_shared(row.id)
+            parcels.drop(row.id, "out")
+            station.audit("export", None, "parcel dropped", parcel=row.id, handover=row.about, why=why)
+        dropped.append(f"1 parcel dropped: {why}")
+    return tuple(dropped)
 
 
 def _expire(station: Station, now: datetime) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import stat
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -11,11 +12,21 @@ import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
-from teds_provision.handover.outgoing import ExportOrder, _of_the_last_run, export_bundle, plan_export
+from teds_provision.handover.outgoing import (
+    ExportOrder,
+    _of_the_last_run,
+    export_all,
+    export_bundle,
+    outputs_of,
+    plan_export,
+    plan_exports,
+)
 from teds_provision.handover.pending import BundleNotes, close, find_handover, undo
 from teds_provision.protocol.handover.bundle import open_bundle
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.plant import PlantRecord
-from tests.bench import Board, make_station
+from tests.bench import Board, make_station, talk
 from tests.handover.desk import Pair, everything, key_up, provisioned, session, trust
 
 
@@ -125,6 +136,42 @@ def test_the_plant_hears_once_of_what_is_sealed_again(pair: Pair) -> None:
         pair.export("copy")
     events = [json.loads(text) for _, _, text in pair.north.plant.outbox(9)]
     assert [event["act"] for event in events] == ["gave"]
+
+
+def test_what_an_export_leaves_in_the_store_and_the_same_again(pair: Pair) -> None:
+    pair.export("move")
+    assert pair.north.identity.certificate(pair.north.ca, pair.south.point) is not None
+    [tombstone] = pair.north.policy.tombstones()
+    early = replace(tombstone, created="2026-01-31T12:00:00Z")
+    pair.north.policy.put_tombstone(early)
+    pair.export("move")
+    assert pair.north.policy.tombstones() == [early], "it rests since the first of them"
+    assert [entry.outcome for entry in pair.north.audit_log.entries() if entry.act == "export"] == ["done", "again"]
+
+
+def test_a_key_that_was_replaced_between_plan_and_sealing_does_not_leave(pair: Pair) -> None:
+    plan = plan_export(pair.north, ExportOrder(("south",), None))
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    with pytest.raises(PolicyError, match=f"Node {pair.board.uuid.hex()} was changed in the meantime"):
+        export_bundle(pair.north, plan, pair.folder / "late.jwe")
+    assert pair.north.handovers.all() == []
+
+
+def test_of_two_bundles_neither_is_made_beside_a_file_that_is_in_the_way(tmp_path: Path) -> None:
+    pair = Pair.make(tmp_path, 2)
+    plans = plan_exports(pair.north, ExportOrder(("south",), None, "move"), most=1)
+    first, second = outputs_of(tmp_path / "out.jwe", 2)
+    second.write_text("a letter")
+    before = everything(pair.north)
+    with pytest.raises(UsageError, match="already exists"):
+        export_all(pair.north, plans, (first, second))
+    assert (first.exists(), everything(pair.north)) == (False, before)
+    second.unlink()
+    made = export_all(pair.north, plans, (first, second))
+    notes = [BundleNotes.from_json(row.nodes) for row in pair.north.handovers.all()]
+    assert [note.run for note in notes] == [made[0].plan.id] * 2
+    pair.close()
 
 
 def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) -> None:

@@ -211,6 +211,24 @@ def test_what_a_spare_gets_and_what_is_said_of_it(station: Station) -> None:
     assert acts == [("decommission", OLD, f"replaced by {NEW.hex()}"), ("replace", NEW, "done")]
 
 
+@pytest.mark.parametrize(("profile", "named"), [("gripper", "built as gripper"), (None, "built")])
+def test_a_draft_that_a_spare_loses_is_named_before_and_after(
+    station: Station, profile: str | None, named: str
+) -> None:
+    station.pins.put(WhitelistEntry(NEW))
+    station.nodes.put(NodeRecord(OLD, NODE.point, name="thumb"))
+    assert plan_takeover(station, OLD, NEW, copy_calibration=False).warnings == ()
+    drafted = Draft(NEW, Image(NEW, {(0, 1): b"x"}), "built", profile, "2026-01-31T12:00:00Z")
+    station.datasheets.keep_draft(drafted)
+    plan = plan_takeover(station, OLD, NEW, copy_calibration=False)
+    warning = f"The draft of node {NEW.hex()} ({named}) was never written; it is dropped."
+    assert (plan.draft, plan.warnings) == (drafted, (warning,))
+    assert take_over(station, plan, None)[0] == (warning,)
+    assert station.datasheets.draft(NEW) is None
+    station.datasheets.keep_draft(drafted)
+    assert plan_takeover(station, OLD, NEW, copy_calibration=False).warnings == (), "it stays: nothing is taken over"
+
+
 def test_a_calibration_that_cannot_be_built_in(station: Station) -> None:
     station.pins.put(WhitelistEntry(NEW))
     station.nodes.put(NodeRecord(OLD, NODE.point))

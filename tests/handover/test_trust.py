@@ -66,6 +66,18 @@ def test_a_key_counts_once_it_was_added_and_until_it_is_removed(north: Station, 
     assert north.policy.trusted_stations() == [north.point]
 
 
+@pytest.mark.parametrize(("ends", "left"), [("lab", "owner"), ("owner", "lab")])
+def test_only_the_named_row_of_a_key_with_two_roles_is_removed(
+    north: Station, keys: Path, ends: str, left: str
+) -> None:
+    (keys / "lab.pem").write_text(to_pem(OTHER.point))
+    add(
+        north, [candidate(north, "lab", keys / "lab.pem", "station"), candidate(north, "owner", keys / "lab.pem", "ca")]
+    )
+    assert remove(north, find_trusted(north, ends)).record.name == ends
+    assert [record.name for record in north.policy.listed()] == [left]
+
+
 def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) -> None:
     path = keys / "lab.pem"
     path.write_text(to_pem(OTHER.point))

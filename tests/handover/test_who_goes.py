@@ -174,6 +174,14 @@ def test_of_two_moves_that_were_cut_the_newest_command_is_carried_on(
     assert [node.uuid for part in parts for node in part.nodes] == again
 
 
+def test_a_copy_to_the_same_station_since_is_no_move_that_was_cut(north: Station) -> None:
+    moved(north, A)
+    moved(north, B)
+    notes = BundleNotes((C.hex(),), "copy", "04", "2026-03-08T08:00:00Z")
+    north.handovers.put(Handover("h2", "out", "copy", (TO_SOUTH,), "open", notes.to_json(), created=NOW.isoformat()))
+    assert going(north, mode="move") == [B]
+
+
 def test_nodes_are_divided_and_those_of_an_open_move_stay_together(north: Station) -> None:
     for uuid in (C, D):
         north.nodes.put(NodeRecord(uuid, NODE))

@@ -242,6 +242,13 @@ def test_what_changes_is_said_in_sentences(station: Station) -> None:
     assert sum(line.startswith("  adds ") for line in first) == 3
 
 
+@pytest.mark.parametrize(("later", "same"), [(0, True), (3599, True), (3600, False), (-1, False), (86400, False)])
+def test_the_same_renewal_again_within_an_hour_changes_nothing(station: Station, later: int, same: bool) -> None:
+    before = held(station)
+    draft = replace(before, version=9, expires=before.expires + timedelta(seconds=later))
+    assert owning.says_the_same(before, owning.same_end(before, draft)) is same
+
+
 def test_a_version_that_changes_nothing_says_the_same(station: Station) -> None:
     before = held(station)
     same = replace(before, version=9, previous="x", created=before.created + timedelta(days=1))

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import RosterExpiredError
-from teds_provision.handover import incoming, life, outgoing
+from teds_provision.handover import incoming, life, outgoing, pending
 from teds_provision.plant import parcels, sign_requests
 from teds_provision.plant.commands import parcels as commands_of_parcels
 from teds_provision.plant.transport import Parcel
@@ -442,6 +442,114 @@ def test_a_copy_that_waits_is_not_sent_once_nothing_shares_it(plant: Plant) -> N
     assert "no share of the roster" in held_back(plant)
     plant.roster({"north": "keeper", "west": "line"}, removed={"south": (0, "")})
     assert "south is no member any more" in held_back(plant)
+
+
+def revoked(station: Station, board: Board) -> None:
+    life.revoke(station, board.uuid, "stolen")
+
+
+def to_be_rotated(station: Station, board: Board) -> None:
+    with station.transaction():
+        station.keys.demand_rotation(board.uuid, "a holder is no longer trusted")
+
+
+OUTDATED = [
+    (revoked, "it is revoked"),
+    (rotated, "its key was replaced since"),
+    (to_be_rotated, "its key must be rotated first"),
+]
+
+
+@pytest.mark.parametrize(("happens", "why"), OUTDATED)
+def test_a_key_that_is_outdated_does_not_leave_with_a_copy_that_waits(plant: Plant, happens: Any, why: str) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    west, south = plant["west"], plant["south"]
+    board, other = (board_of(west, os.urandom(10)) for _ in range(2))
+    plant.transport.full = True
+    sync(plant, "west")
+    plant.transport.full = False
+    happens(west, board)
+    done = parcels.send_out(west, plant.transport, plant.views("west"), now())
+    cause = f"keys for south, because of node {board.uuid.hex()}: {why}"
+    assert done.held_back == (f"1 parcel dropped: {cause}; a new copy has what may still go",)
+    assert [entry.outcome for entry in west.audit_log.entries() if entry.act == "export"][-2:] == [
+        "parcel dropped", "done"
+    ]  # fmt: skip
+    sync(plant, "south")
+    assert holds(south, other.uuid) == [(1, "import")]
+    assert holds(south, board.uuid) == ([(2, "import")] if happens is rotated else [])
+
+
+@pytest.mark.parametrize(("happens", "why"), OUTDATED)
+def test_a_copy_that_was_ordered_is_held_back_once_a_key_in_it_is_outdated(
+    plant: Plant, happens: Any, why: str
+) -> None:
+    plant.roster(ROLES)
+    west = plant["west"]
+    board, other = (board_of(west, os.urandom(10)) for _ in range(2))
+    order = outgoing.ExportOrder(("south",), (board.uuid, other.uuid))
+    with west.lock("test"):
+        parcels.send_export(west, outgoing.plan_export(west, order), now())
+    happens(west, board)
+    for _ in range(2):
+        assert held_back(plant) == (
+            f"1 parcel held back: keys for south, because of node {board.uuid.hex()}: {why}."
+            " To send what may still go: export-keys --to south UUID --send"
+        )
+
+
+def test_a_move_that_waits_is_held_back_once_a_node_is_revoked_and_dropped_once_it_is_undone(plant: Plant) -> None:
+    plant.roster(ROLES)
+    west = plant["west"]
+    board, other = (board_of(west, os.urandom(10)) for _ in range(2))
+    with west.lock("test"):
+        plan = outgoing.plan_export(west, outgoing.ExportOrder(("south",), (board.uuid, other.uuid), "move"))
+        parcels.send_export(west, plan, now())
+    to_be_rotated(west, other)
+    revoked(west, board)
+    assert held_back(plant) == (
+        f"1 parcel held back: keys for south, because of node {board.uuid.hex()}: it is revoked."
+        f" Take the move back, then move the others: handover undo {plan.id}"
+    )
+    with west.lock("test"):
+        pending.undo(west, pending.find_handover(west, plan.id))
+    assert held_back(plant) == f"1 parcel dropped: keys for south, as the move {plan.id} was undone"
+    assert parcels.waiting_out(west) == 0
+
+
+def test_parcels_that_are_refused_are_named_with_the_exit_code_of_the_refusal(plant: Plant, tmp_path: Path) -> None:
+    plant.roster(ROLES)
+    west, south = plant["west"], plant["south"]
+    boards = [board_of(west, os.urandom(10)) for _ in range(2)]
+    for board in boards:
+        with west.lock("test"):
+            order = outgoing.ExportOrder(("south",), (board.uuid,))
+            parcels.send_export(west, outgoing.plan_export(west, order), now())
+    sync(plant, "west", "south")
+    first, second = (row.id for row in south.plant.parcels.all("in", "waiting"))
+    uuids = {row.id: pending_uuid(south, row.id) for row in south.plant.parcels.all("in", "waiting")}
+    life.revoke(south, uuids[first], "stolen")
+    words = ("import-keys", "--received", "--yes")
+    shown = call(tmp_path / "south", "--json", *words, "--dry-run")
+    assert (shown.code, [one["parcel"] for one in shown.json["received"]]) == (6, [second])
+    done = call(tmp_path / "south", *words)
+    assert (done.code, done.out) == (6, "1 parcel imported; the receipts leave with the next sync. 1 parcel refused.\n")
+    assert f"Warning: Parcel {first} is refused: None of the nodes in the bundle can be imported" in done.err
+    assert done.err.endswith("The parcel stays here until it expires. Notify the sender.\n")
+    again = call(tmp_path / "south", *words)
+    assert (again.code, again.out) == (6, "0 parcels imported. 1 parcel refused.\n")
+    told = call(tmp_path / "south", "--json", *words)
+    assert (told.code, told.json["received"], told.json["error"]["code"]) == (6, [], "refused")
+    assert [one["parcel"] for one in told.json["refused"]] == [first]
+    assert told.json["refused"][0]["why"] == told.json["error"]["message"]
+
+
+def pending_uuid(station: Station, parcel: str) -> bytes:
+    """Return the one node of a bundle that waits."""
+    plan = incoming.plan_import(station, station.plant.parcels.document(parcel, "in"))
+    assert isinstance(plan, incoming.ImportPlan)
+    [planned] = plan.nodes
+    return planned.node.uuid
 
 
 def test_a_copy_is_not_ordered_under_a_roster_that_has_expired(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:

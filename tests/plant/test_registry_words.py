@@ -316,6 +316,16 @@ def test_alarms_are_acknowledged_and_counted(home: Path, monkeypatch: pytest.Mon
         assert call(home, "--json", "registry", "seen").json == {"done": sum(counts)}
 
 
+def test_a_renewal_is_run_again_with_nothing_to_do(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert call(home, "--json", "registry", "renew", "--yes").json["version"] == 2
+    later = datetime.now(UTC) + timedelta(minutes=59)
+    monkeypatch.setattr(plant.owner, "now", lambda: later)
+    for more in (["--dry-run"], ["--yes"]):
+        assert call(home, "registry", "renew", *more).out == "Nothing to do: roster 2 already says so.\n"
+    for days in (89, 91):
+        assert call(home, "--json", "registry", "renew", "--days", days, "--dry-run").json["version"] == 3
+
+
 def test_a_roster_that_says_the_same_is_not_signed_again(home: Path, tmp_path: Path) -> None:
     out = tmp_path / "roster.jws"
     words = ("registry", "role", "owner", "keeper", "line", "sign", "base", "--output", out)

@@ -360,6 +360,27 @@ def test_party_info_enters_the_key():
         opened(dump(jwe(unprotected={"apu": "A" * 400})))
 
 
+def test_party_info_of_256_octets_is_read_and_no_more():
+    for octets, error, says in ((256, NotAuthenticError, "does not open"), (257, BadDataError, "longer than 256")):
+        for name in ("apu", "apv"):
+            with pytest.raises(error, match=says):
+                opened(dump(jwe(unprotected={name: encode_base64url(bytes(octets))})))
+
+
+@pytest.mark.parametrize("octets", [0, 8, 24, 32, 39, 41, 48])
+def test_an_encrypted_key_has_40_octets(octets):
+    members = jwe()
+    members["recipients"][0]["encrypted_key"] = encode_base64url(bytes(octets))
+    with pytest.raises(BadDataError, match=f"encrypted key has {octets} octets, not 40"):
+        opened(dump(members))
+
+
+@pytest.mark.parametrize("cty", ["jws", "Jws"])
+def test_the_content_type_counts_in_any_case(cty):
+    assert opened(jose.encrypt(PAYLOAD, [RECEIVER.point], cty=cty)) == PAYLOAD
+    assert jose.decrypt(dump(jwe()), RECEIVER, cty=cty, max_octets=LIMIT) == PAYLOAD
+
+
 def test_every_truncation_is_refused():
     octets = jose.encrypt(PAYLOAD, [RECEIVER.point], cty="JWS")
     for length in range(len(octets)):

@@ -229,8 +229,10 @@ def replace(
     if dry_run and shown.done and not station.measurements.has_node(octets):
         app.emit({**result, "moved": HandedOn().to_json(), "fresh": False}, _TAKEN_OVER)
         return
+    for warning in shown.warnings:
+        app.warn(warning)
     if dry_run:
-        app.emit({**result, "plan": True}, f"Plan: {text}.")
+        app.emit({**result, "warnings": list(shown.warnings), "plan": True}, f"Plan: {text}.")
         return
     receipt = None
     if not shown.done:
@@ -240,7 +242,8 @@ def replace(
         receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
     with station.lock("replace", app.note):
         plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
-        require_same(_takeover(plan)[0] == _takeover(shown)[0] and plan.done == shown.done)
+        same = _takeover(plan)[0] == _takeover(shown)[0] and plan.warnings == shown.warnings
+        require_same(same and plan.done == shown.done)
         if plan.done:
             moved = hand_on(station, plan)
         else:
@@ -250,7 +253,7 @@ def replace(
         text = "It has already taken over." if rest else _TAKEN_OVER
         app.emit({**result, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
         return
-    for warning in warnings:
+    for warning in warnings[len(shown.warnings) :]:  # those of the plan were printed before the question
         app.warn(warning)
     confirmed = receipt is not None
     next_step = f"Next, run provision (or sign and write) for {spare.hex()}."

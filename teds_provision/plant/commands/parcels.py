@@ -15,8 +15,9 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.extending import add_examples, add_options, callback_of
 from teds_provision.cli.station.handover import import_plan, import_text, require_as_shown
 from teds_provision.errors import RosterExpiredError, TedsProvisionError
-from teds_provision.handover.incoming import plan_import
+from teds_provision.handover.incoming import NothingImportedError, plan_import
 from teds_provision.handover.outgoing import ExportPlan
+from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 
 
@@ -82,10 +83,13 @@ def extend_import(command: click.Command) -> None:
 
 
 def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
-    """Show each waiting parcel with its reason; take in those that the user confirms."""
+    """Show each waiting parcel with its reason; take in those that the user confirms.
+
+    One that is refused does not keep the others from being imported; the command then ends with the first refusal.
+    """
     plant.apply_pages.require_roster(station)
     station.unlock()
-    parcels, results = station.plant.parcels, list[dict[str, Any]]()
+    parcels, results, refused = station.plant.parcels, list[dict[str, Any]](), dict[str, TedsProvisionError]()
     for row in parcels.all("in", "waiting", "later"):
         if row.kind != "bundle":
             continue
@@ -93,7 +97,10 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
         try:
             shown = plan_import(station, octets)
         except TedsProvisionError as error:
-            app.warn(f"{row.id}: {error.message}")
+            app.warn(f"Parcel {row.id} is refused: {error.message}")
+            if isinstance(error, NothingImportedError):  # others may be imported all the same
+                error.hint = "The parcel stays here until it expires. Notify the sender."
+            refused[row.id] = error
             continue
         app.note(f"{import_text(station, shown)}\nReason for waiting: {row.detail or 'it has just arrived'}")
         one = {**import_plan(shown), "parcel": row.id, "why": row.detail}
@@ -106,6 +113,12 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             require_as_shown(plan, shown)
             done = plant.parcels.import_parcel(station, row, plan)
         one["fresh"] = done.fresh
-    count = f"{len(results)} parcel{'s' * (len(results) != 1)}"
-    text = f"{count}." if dry_run else f"{count} imported; the receipts leave with the next sync."
-    app.emit({"received": results, "plan": dry_run}, text if results else "Nothing waits.")
+    text = f"{counted(len(results), 'parcel')}"
+    text += "." if dry_run else " imported; the receipts leave with the next sync." if results else " imported."
+    text += f" {counted(len(refused), 'parcel')} refused." if refused else ""
+    listed = [{"parcel": parcel, "why": error.message} for parcel, error in refused.items()]
+    app.conclude(
+        {"received": results, "refused": listed, "plan": dry_run},
+        text if results or refused else "Nothing waits.",
+        next(iter(refused.values()), None),
+    )

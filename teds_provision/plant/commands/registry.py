@@ -338,7 +338,8 @@ def renew(app: App, /, days: int, redate: bool, **how: Any) -> None:
     held = plant.apply_pages.require_roster(station)
     if redate:
         plant.owner.require_wrong_date(station, held)
-    _emit_change(app, station, plant.owner.renewed(station, timedelta(days=days), redate=redate), **_named(how))
+    draft = plant.owner.renewed(station, timedelta(days=days), redate=redate)
+    _emit_change(app, station, draft if redate else plant.owner.same_end(held, draft), **_named(how))
 
 
 def _named(how: dict[str, Any]) -> dict[str, Any]:
