@@ -12,19 +12,27 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
+from teds_provision.handover.pending import BundleNotes
 from teds_provision.handover.trust import (
     Certificate,
+    CertificateRequest,
     add,
     candidate,
     candidates_of,
+    find_removed,
     find_trusted,
+    make_request,
+    plan_removal,
     private_keys,
+    read_request,
     remove,
+    sign_request,
     spoken,
     write_certificate,
 )
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import Handover
 from tests.bench import make_station
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -252,6 +260,98 @@ def test_a_certificate_that_does_not_verify(north: Station, keys: Path) -> None:
     (keys / "lab.cert").write_bytes(write_certificate(forged))
     with pytest.raises(NotAuthenticError):
         candidate(north, "lab", keys / "lab.cert", "station")
+
+
+@pytest.mark.parametrize(
+    ("name", "good"), [("a", True), ("a" * 100, True), ("a" * 101, False), ("", False), ("a\tb", False)]
+)
+def test_the_name_in_a_request(name: str, good: bool) -> None:
+    octets = make_request(name, OTHER)
+    if good:
+        assert read_request(octets) == CertificateRequest(name, OTHER.point)
+    else:
+        with pytest.raises(BadDataError, match="name"):
+            read_request(octets)
+
+
+def test_what_is_no_request_and_whose_is_not_signed(north: Station) -> None:
+    with pytest.raises(BadDataError, match="contains a private key, not a request"):
+        read_request(make_request("PRIVATE KEY", OTHER))
+    with pytest.raises(PolicyError, match="names the CA's own key as a station"):
+        sign_request(north, CertificateRequest("lab", north.ca))
+    sign_request(north, CertificateRequest("lab", OTHER.point))
+    sign_request(north, CertificateRequest("lab", OTHER.point))
+    assert [entry.detail["name"] for entry in north.audit_log.entries() if entry.act == "certify"] == ["lab"]
+
+
+def test_a_certificate_is_no_ca(north: Station, keys: Path) -> None:
+    (keys / "lab.cert").write_bytes(write_certificate(sign_request(north, CertificateRequest("lab", OTHER.point))))
+    with pytest.raises(UsageError) as caught:
+        candidate(north, "lab", keys / "lab.cert", "ca")
+    assert (caught.value.message.endswith("is a station's certificate, not a CA's key."), caught.value.hint) == (
+        True, "Omit --role."
+    )  # fmt: skip
+
+
+def test_which_files_of_a_folder_are_keys(north: Station, keys: Path) -> None:
+    pem = to_pem(OTHER.point)
+    for name in ("a.pem", "b.pub", "c.ca.pub", ".hidden.pem", "d.txt"):
+        (keys / name).write_text(pem)
+    (keys / "deep").mkdir()
+    (keys / "deep" / "e.pem").write_text(pem)
+    found = [(key.record.name, key.record.role) for key in candidates_of(north, keys, "station")]
+    assert found == [("a", "station"), ("b", "station"), ("c", "ca"), ("e", "station")]
+
+
+def test_a_name_counts_before_the_digits_of_another_key(north: Station, keys: Path) -> None:
+    digits = fingerprint(OTHER.point)
+    for name, number in (("lab", 21), (digits[:8], 22)):
+        (keys / "key.pem").write_text(to_pem(SoftwareKey(number).point))
+        add(north, [candidate(north, name, keys / "key.pem", "station")])
+    assert find_trusted(north, digits[:8]).point == SoftwareKey(22).point
+    assert find_trusted(north, digits[:9]).point == OTHER.point
+
+
+def test_a_key_that_was_removed_is_found_as_the_last_one_under_its_name_or_digits(north: Station, keys: Path) -> None:
+    for number in (21, 22):
+        (keys / "key.pem").write_text(to_pem(SoftwareKey(number).point))
+        add(north, [candidate(north, "lab", keys / "key.pem", "station")])
+        assert (find_removed(north, "lab") is None) is (number == 21), "only added"
+        remove(north, find_trusted(north, "lab"))
+    first, last = (fingerprint(SoftwareKey(number).point) for number in (21, 22))
+    found = [find_removed(north, text) for text in ("lab", first[:8].upper(), spoken(last), first[:7], "la")]
+    assert [key.fingerprint if key is not None else None for key in found] == [last, first, last, None, None]
+
+
+def brought(
+    north: Station, ca: bytes, peer: str, *, direction: str = "in", state: str = "imported", id: str = "h1"
+) -> None:
+    notes = BundleNotes((), "content", ca.hex(), "2026-03-08T08:00:00Z")
+    north.handovers.put(Handover(id, direction, "copy", (peer,), state, notes.to_json()))  # type: ignore[arg-type]
+
+
+def test_what_ends_with_the_trust_in_a_station(north: Station, keys: Path) -> None:
+    west, ca, own_ca = SoftwareKey(22), SoftwareKey(23).point, SoftwareKey(24).point
+    for name, point, role in (
+        ("lab", OTHER.point, "station"),
+        ("west", west.point, "station"),
+        ("owner", own_ca, "ca"),
+    ):
+        (keys / "key.pem").write_text(to_pem(point))
+        add(north, [candidate(north, name, keys / "key.pem", role)])  # type: ignore[arg-type]
+    lab, other = fingerprint(OTHER.point), fingerprint(west.point)
+    record = find_trusted(north, "lab")
+    for number, (point, to, direction, state) in enumerate((
+        (ca, lab, "in", "imported"), (own_ca, lab, "in", "imported"), (north.ca, lab, "in", "imported"),
+        (SoftwareKey(25).point, lab, "out", "open"), (north.ca, lab, "out", "closed"), (north.ca, other, "out", "open"),
+    )):  # fmt: skip
+        brought(north, point, to, direction=direction, state=state, id=f"h{number}")
+    plan = plan_removal(north, record)
+    assert (plan.cas, plan.open, plan.bans, plan.shared, plan.under) == ((ca,), ("h3",), (), (), 0)
+    brought(north, ca, other, id="h9")
+    assert plan_removal(north, record).cas == (), "west brought it too"
+    ends = plan_removal(north, find_trusted(north, "owner"))
+    assert (ends.cas, ends.open) == ((own_ca,), ())
 
 
 def test_a_fingerprint_as_it_is_spoken() -> None:

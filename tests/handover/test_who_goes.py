@@ -178,7 +178,9 @@ def test_a_copy_to_the_same_station_since_is_no_move_that_was_cut(north: Station
     moved(north, A)
     moved(north, B)
     notes = BundleNotes((C.hex(),), "copy", "04", "2026-03-08T08:00:00Z")
-    north.handovers.put(Handover("h2", "out", "copy", (TO_SOUTH,), "open", notes.to_json(), created=NOW.isoformat()))
+    north.handovers.put(
+        Handover("h2", "out", "copy", (TO_SOUTH,), "open", notes.to_json(), created="2026-03-01T09:00:00Z")
+    )
     assert going(north, mode="move") == [B]
 
 
