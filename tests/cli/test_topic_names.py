@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -49,8 +50,21 @@ def test_names_are_listed_for_people_and_as_json(home: Path, topic: str) -> None
     assert (one["chosen"], two["chosen"], one["frame"], set(one)) == (
         True, False, "arm_x", {"uuid", "channel", "topic", "chosen", "frame"}
     )  # fmt: skip
+    call(home, "names", "frame", NODE, "2", "tip")
+    assert [each["frame"] for each in listed(home)["names"]] == ["arm_x", "tip"], "its own goes before its node's"
     call(home, "names", "set", NODE, "0", "right")
     assert [each["chosen"] for each in listed(home)["names"]] == [True, True]
+
+
+def test_without_a_chosen_frame_that_of_the_profile_is_listed_with_the_nodes_name_in_it(
+    home: Path, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_type = {2: SimpleNamespace(frame="{node}_{node}_tip"), 1: SimpleNamespace(frame="")}
+    monkeypatch.setattr(commands, "channel_profiles", lambda _station, _uuid: of_type)
+    assert [each["frame"] for each in listed(home)["names"]] == [None, "left_left_tip"]
+    call(home, "names", "set", NODE, "0", "right")
+    call(home, "names", "frame", NODE, "1", "base")
+    assert [each["frame"] for each in listed(home)["names"]] == ["base", "right_right_tip"]
 
 
 @pytest.mark.parametrize(

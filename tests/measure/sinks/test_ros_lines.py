@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -200,3 +201,196 @@ def test_the_counters_of_a_sink_are_those_of_the_moment_when_they_were_asked_for
     sink._count(written=2, dropped=5)
     assert (before.written, before.dropped) == (3, 1)
     assert (sink.stats.written, sink.stats.dropped) == (5, 6)
+
+
+def rclpy_bridge(node: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a child's bridge to a node; rclpy and its messages are named by what they are asked for."""
+
+    def named(name: str) -> Any:
+        return lambda *values, **fields: SimpleNamespace(kind=name, values=values, **fields)
+
+    def module(name: str) -> Any:
+        return SimpleNamespace(
+            Float64="Float64", JointState="JointState", SetParametersResult=named("result"),
+            ParameterDescriptor=named("descriptor"),
+        )  # fmt: skip
+
+    policies = SimpleNamespace(
+        QoSProfile=lambda **profile: tuple(profile[name] for name in ("history", "depth", "reliability", "durability")),
+        HistoryPolicy=SimpleNamespace(KEEP_LAST="last"),
+        ReliabilityPolicy=SimpleNamespace(BEST_EFFORT="best effort", RELIABLE="reliable"),
+        DurabilityPolicy=SimpleNamespace(TRANSIENT_LOCAL="latched", VOLATILE="volatile"),
+    )
+    parameters = SimpleNamespace(Parameter=lambda name, *, value: (name, value))
+    for name, made in (
+        ("rclpy", SimpleNamespace(qos=policies)), ("rclpy.qos", policies), ("rclpy.parameter", parameters)
+    ):  # fmt: skip
+        monkeypatch.setitem(sys.modules, name, made)
+    monkeypatch.setattr(rclpy_child, "importlib", SimpleNamespace(import_module=module))
+    return rclpy_child.Bridge(None, node)
+
+
+def test_writers_are_reliable_metadata_stay_for_late_comers_and_set_points_come_by_best_effort(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[tuple[object, ...]] = []
+    node = SimpleNamespace(
+        add_on_set_parameters_callback=lambda _callback: None,
+        create_publisher=lambda kind, topic, qos: made.append((topic, kind, *qos)),
+        create_subscription=lambda kind, topic, _came, qos: made.append((topic, kind, *qos)) or topic,
+    )
+    bridge = rclpy_bridge(node, monkeypatch)
+    for latch, topic in ((False, "/arm"), (True, "/teds")):
+        bridge.topic({"id": 1, "topic": topic, "type": "std_msgs/Float64", "latch": latch})
+    for _ in range(2):  # it is announced again after a name has changed
+        bridge.listen({"topic": "/cmd", "uuid": "aa", "channel": 1})
+        bridge.listen_joints({"topic": "/joint_commands"})
+    assert made == [
+        ("/arm", "Float64", "last", 100, "reliable", "volatile"),
+        ("/teds", "Float64", "last", 1, "reliable", "latched"),
+        ("/cmd", "Float64", "last", 1, "best effort", "volatile"),
+        ("/joint_commands", "JointState", "last", 1, "best effort", "volatile"),
+    ]
+
+
+def test_the_facts_of_a_channel_are_parameters_that_nobody_else_sets(monkeypatch: pytest.MonkeyPatch) -> None:
+    held: dict[str, object] = {}
+    guards: list[Any] = []
+
+    def may() -> bool:
+        return bool(guards[0](()).successful)
+
+    def declare(name: str, value: object, descriptor: Any) -> None:
+        assert (may(), descriptor.dynamic_typing) == (True, True)
+        held[name] = value
+
+    def put(parameters: list[tuple[str, object]]) -> None:
+        assert may()
+        held.update(parameters)
+
+    node = SimpleNamespace(
+        add_on_set_parameters_callback=guards.append,
+        has_parameter=held.__contains__,
+        declare_parameter=declare,
+        set_parameters=put,
+    )
+    bridge = rclpy_bridge(node, monkeypatch)
+    facts: dict[str, object] = {"unit": "rad", "high": 6, "vector": [1, 2.5], "names": ["a"], "calibration": {"x": 1}}
+    bridge.param({"key": "/bench/arm/angle", "value": facts})
+    bridge.param({"key": "/bench/arm/angle", "value": {"unit": "m", "overdue": True, "none": [], "mixed": ["a", 1]}})
+    refused = guards[0](())
+    assert (refused.successful, refused.reason) == (False, "a fact of a signed datasheet")
+    assert held == {
+        "bench.arm.angle.unit": "m", "bench.arm.angle.high": 6, "bench.arm.angle.vector": [1.0, 2.5],
+        "bench.arm.angle.names": ["a"], "bench.arm.angle.calibration": '{"x": 1}', "bench.arm.angle.overdue": True,
+        "bench.arm.angle.none": [], "bench.arm.angle.mixed": '["a", 1]',
+    }  # fmt: skip
+
+    def broken(_name: str) -> bool:
+        raise RuntimeError
+
+    node.has_parameter = broken
+    with pytest.raises(RuntimeError):
+        bridge.param({"key": "/x", "value": {"unit": "m"}})
+    assert not may(), "also after an error"
+
+
+@pytest.mark.parametrize(
+    ("around", "alone"),
+    [
+        ({}, False),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, True),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}, True),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, True),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, False),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "10.0.0.2"}, False),
+        ({"ROS_STATIC_PEERS": "10.0.0.2"}, False),
+        ({"ROS_LOCALHOST_ONLY": "1"}, True),
+        ({"ROS_LOCALHOST_ONLY": "0"}, False),
+    ],
+)
+def test_ports_are_kept_on_loopback_only_where_the_environment_keeps_ros_on_this_machine(
+    around: dict[str, str], alone: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in around.items():
+        monkeypatch.setenv(name, value)
+    assert rclpy_child.on_this_machine_alone() is alone
+
+
+def test_the_ports_of_a_domain() -> None:
+    assert rclpy_child.ports_of(0) == range(7400, 7650)
+    assert rclpy_child.ports_of(7, 74) == range(9150, 9224)
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"), [("plain", {"latched": False}), ("latched", {"latched": True}), ("reading", {"latched": False})]
+)
+def test_cyclone_dds_offers_and_asks_for_the_same(kind: str, what: dict[str, bool]) -> None:
+    pytest.importorskip("cyclonedds.core")
+    from cyclonedds.qos import Policy
+
+    sink = Ros2Sink("ros2:7")
+    sink._types = pytest.importorskip("teds_provision.measure.sinks.ros.ros2_types")
+    qos = sink._qos("std_msgs/Float64", reading=kind == "reading", **what)
+    depth = {"plain": 100, "latched": 1, "reading": 10}[kind]
+    assert qos[Policy.History] == Policy.History.KeepLast(depth)
+    assert (qos[Policy.Reliability] == Policy.Reliability.BestEffort) is (kind == "reading")
+    assert qos[Policy.Durability] == (
+        Policy.Durability.TransientLocal if kind == "latched" else Policy.Durability.Volatile
+    )
+
+
+def test_another_program_of_the_same_name_ends_a_rospy_child_with_its_own_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    codes: list[int] = []
+    monkeypatch.setattr(ros1_child.os, "_exit", codes.append)
+    for reason in ("new node registered with same name", "shutdown request", ""):
+        ros1_child.leave(reason)
+    assert codes == [4]
+
+
+def test_a_parameter_that_the_master_does_not_take_is_reported_and_ends_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    held: dict[str, object] = {}
+
+    def put(key: str, value: object) -> None:
+        if key == "/gone":
+            raise OSError("no master")
+        held[key] = value
+
+    bridge = ros1_child.Bridge(SimpleNamespace(set_param=put), None)
+    bridge.param({"key": "/bench/arm/angle", "value": {"unit": "rad"}})
+    bridge.param({"key": "/gone", "value": 1})
+    assert held == {"/bench/arm/angle": {"unit": "rad"}}
+    assert capsys.readouterr().out == '{"event": "trouble", "what": "parameter /gone: no master"}\n'
+
+
+@BOTH
+def test_a_set_point_is_passed_on_with_all_its_digits_and_a_topic_is_subscribed_once(
+    way: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    heard: list[tuple[str, Any]] = []
+    if way == "rclpy":
+        node = SimpleNamespace(
+            add_on_set_parameters_callback=lambda _callback: None,
+            create_subscription=lambda _kind, topic, came, _qos: heard.append((topic, came)) or topic,
+        )
+        bridge = rclpy_bridge(node, monkeypatch)
+    else:
+        ros = SimpleNamespace(
+            Subscriber=lambda topic, _kind, came, queue_size: heard.append((topic, came)) or (topic, queue_size)
+        )
+        bridge = ros1_child.Bridge(ros, None)
+        monkeypatch.setattr(bridge, "type_of", lambda name: name)
+    for _ in range(2):
+        bridge.listen({"topic": "/cmd", "uuid": "aa", "channel": 3})
+        bridge.listen_joints({"topic": "/joints"})
+    assert [topic for topic, _ in heard] == ["/cmd", "/joints"]
+    heard[0][1](SimpleNamespace(data=0.1 + 0.2))
+    heard[1][1](SimpleNamespace(name=["a", "b"], position=[1, math.nan], velocity=[], effort=[2.5]))
+    assert capsys.readouterr().out.splitlines() == [
+        '{"event": "command", "uuid": "aa", "channel": 3, "value": "0.30000000000000004"}',
+        '{"event": "joints", "names": ["a", "b"], "position": ["1.0", "nan"], "velocity": [], "effort": ["2.5"]}',
+    ]
