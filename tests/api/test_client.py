@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -116,7 +117,7 @@ def test_each_call_asks_what_it_says(ask: Callable[[Desk], Any], expected: tuple
 class Line:
     """A connection that answers what it is given, in order: an answer, or the failure of the request; a mock."""
 
-    sock = None
+    sock: Any = None
 
     def __init__(self, *answers: Any) -> None:
         self.answers, self.sent, self.closed = list(answers), list[tuple[Any, ...]](), 0
@@ -482,3 +483,21 @@ def test_who_may_not_see_live_messages_is_refused_as_by_any_request(monkeypatch:
     with pytest.raises(ApiError, match="A token is required") as refused:
         next(Client("http://bench:1").live())
     assert (refused.value.status, refused.value.code, refused.value.exit_code) == (401, "no-token", 6)
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_change_is_not_sent_on_a_connection_that_the_base_station_has_ended(ended: bool) -> None:
+    """It does after half a minute; sent there, the change would fail, and could not be sent again."""
+    first, second = Line(GOOD, GOOD), Line(GOOD)
+    client = Wired(first, second)
+    client.request("GET", "/status")
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        first.sock = ours
+        if ended:
+            theirs.close()
+        client.request("POST", "/discover", {})
+    assert (len(first.sent), len(second.sent), first.closed) == ((1, 1, 1) if ended else (2, 0, 0))
+    client.close()
+    client.close()
+    assert (first.closed, second.closed) == ((1, 1) if ended else (1, 0))

@@ -612,3 +612,36 @@ def test_without_an_image_or_a_package_nothing_is_planned(monkeypatch: pytest.Mo
         with pytest.raises(NotFoundError, match=f"Firmware updates need the package {missing}") as needed:
             updates._image_of(b"x")
         assert "[update]" in needed.value.hint
+
+
+def test_a_start_without_an_update_that_was_cut_begins_none(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench.updates, "_begin", lambda *_words: pytest.fail("nothing was cut"))
+    bench.updates.start()
+    assert bench.updates.all() == []
+    UpdateFolder(bench.updates._station.home).keep_new(bench.action(BoardRow(NODE), state="done"), b"image")
+    bench.updates.start()
+    assert [action["state"] for action in bench.updates.all()] == ["done"]
+    assert [path.name for path in (bench.updates._station.home / FOLDER).iterdir()] == ["a1.json"]
+
+
+@pytest.mark.parametrize(
+    ("ended", "now", "seconds"), [(None, 112.34567, 12.346), (105.5, 112.0, 5.5), (None, 90.0, 0.0)]
+)
+def test_an_update_lasts_until_its_end_or_until_now(
+    ended: float | None, now: float, seconds: float, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that was set back makes it no shorter than nothing."""
+    monkeypatch.setattr(update_actions, "time", SimpleNamespace(time=lambda: now))
+    row = BoardRow(NODE, seconds=1.23456, result="updated", before="1.0.0", step=None)
+    action = bench.action(row, BoardRow(OTHER, result="updated"), BoardRow("ef" * 10), began=100.0)
+    action.ended, action.id = ended, ""
+    shown = action.as_json()
+    assert shown["totals"] == {
+        "updated": 2, "already": 0, "reverted": 0, "refused": 0, "lost": 0, "seconds": seconds,
+    }  # fmt: skip
+    assert (shown["id"], shown["began"], shown["ended"]) == (None, 100.0, ended)
+    assert shown["boards"][0] == {
+        "uuid": NODE, "from": "1.0.0", "to": "1.1.0", "state": "waiting", "board": None, "plan": None, "octets": 0,
+        "seconds": 1.235, "interrupts": [], "question": "", "step": None, "written": 0, "result": "updated",
+        "error": None,
+    }  # fmt: skip
