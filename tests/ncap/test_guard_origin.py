@@ -442,13 +442,15 @@ def test_at_most_fifty_requests_are_slowed_down_at_once(
 def test_the_login_address_is_asked_for_and_never_posted_to(tmp_path: Path) -> None:
     tokens = Tokens(tmp_path)
     guard, link = Guard(app, tokens, front((), PORT, tls=False)), tokens.login_link()
-    words = {"path": "/login", "query_string": f"token={link}".encode(), "headers": {"host": HERE}}
+    words: dict[str, Any] = {"path": "/login", "query_string": f"token={link}".encode(), "headers": {"host": HERE}}
     for method in ("POST", "HEAD", "PUT"):
         status, _, text = answer_of(guard, method=method, **words)
         assert (status, json.loads(text)["error"]) == (
             405, {"code": "usage", "message": "The login address takes GET requests only.", "hint": ""},
         )  # fmt: skip
-    assert answer_of(guard, **words)[0] == 303, "the link was not used up"
+    words["headers"] = {"host": HERE, "accept": "text/html"}
+    status, headers, text = answer_of(guard, **words)
+    assert (status, headers["location"], text) == (303, "/", ""), "the link was not used up"
     assert answer_of(guard, path="/login", headers={"host": HERE})[0] == 401
     assert answer_of(guard, path="/login", headers={"host": "evil.example"})[0] == 421
 
