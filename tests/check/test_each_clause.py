@@ -13,11 +13,14 @@ from typing import Any, ClassVar
 
 import pytest
 
+from teds_provision.check import measuring_rules
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError
 from teds_provision.check.rule import Rule, RuleResult
 from teds_provision.check.run import _Run
 from teds_provision.protocol.messages.frames import Attribute, Command, Reply, TedsStatus
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
+from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeCommand
 from teds_provision.protocol.session import StationSession
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
@@ -26,10 +29,10 @@ from teds_provision.teds.image import SECURITY
 from . import bends, nodes
 from .faulty import FaultyBus
 
-Change = Callable[[bytes], bytes]
+Change = Callable[[Any], Any]
 Row = tuple[str, str, int, Change | int, str]
-"""A rule, the command or ``teds`` (the Security TEDS as it is read), which of its replies (1 on, or -1 the last),
-how its payload comes now or the reason of a refusal, and words of what is found."""
+"""A rule; the command, ``teds`` (the Security TEDS as it is read) or ``messages``; which of its replies (1 on,
+or -1 for the last); how its payload comes now, or the reason of a refusal; words of what is found."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,9 @@ ROWS: list[Row] = [
     ("stream-messages", "128.14", 1, 21, "refusal 21"),
     ("stream-messages", "128.14", 1, _shorter, "Subscribe (128.14)"),
     ("stream-messages", "128.14", 1, _xor(3, 1), "are announced"),
+    ("stream-messages", "messages", 1, lambda came: came[:-1], "2 data messages within"),
+    ("stream-messages", "messages", 2, lambda came: came[::-1], "came after one with"),
+    ("stream-messages", "messages", 3, lambda came: [*came, b"\xff" * 15], "a data message left after its reply"),
     ("drive-replay", "128.20", 1, _xor(1, 2), "run 3; 1 is due"),
     ("drive-replay", "128.20", 1, _xor(3, 1), "are announced"),
     ("drive-replay", "128.16", 3, _at(30, b"\xff" * 4), "none had a good tag"),
@@ -184,8 +190,15 @@ class _Bench:
         def read(probe: Probe, block: tuple[int, int]) -> bytes:
             octets = teds(probe, block)
             change = self.due("teds") if block == SECURITY else None
-            return change(octets) if callable(change) else octets
+            return bytes(change(octets)) if callable(change) else octets
 
+        messages = measuring_rules._messages
+
+        def heard(*args: Any, **more: Any) -> list[bytes]:
+            came, change = messages(*args, **more), self.due("messages")
+            return list(change(came)) if callable(change) else came
+
+        patch.setattr(measuring_rules, "_messages", heard)
         patch.setattr(Probe, "plain", plainly)
         patch.setattr(Probe, "_sealed", in_session)
         patch.setattr(Probe, "teds", read)
@@ -250,3 +263,17 @@ def test_each_clause_of_a_rule_finds_the_reply_that_breaks_it(
 ) -> None:
     found = _found(station, monkeypatch, ROWS, "measuring can")
     assert [(row[:3], row[4], why) for row, why in found.items() if row[4] not in why or not why] == []
+
+
+def test_a_data_message_of_the_test_pattern_has_its_flag_and_the_sample_of_its_counter() -> None:
+    key = bytes(range(32))
+    asked = SubscribeCommand(0, StreamKind.PERIODIC, 1, 0, 10**6, 0, (3,), test_pattern=True)
+
+    def look(flags: int, sample: str) -> None:
+        message = DatagramSealer(stream_key(key, 2)).seal(300, bytes([flags]) + bytes.fromhex(sample))
+        measuring_rules._right_message(key, 2, message, asked, 2)
+
+    look(0x80, "012f")
+    for flags, sample, words in ((0x01, "012f", "sets bit 7"), (0x80, "0130", "0130; the test pattern has 012f")):
+        with pytest.raises(RuleBrokenError, match=words):
+            look(flags, sample)

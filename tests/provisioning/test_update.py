@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +25,7 @@ from teds_provision.errors import (
     PolicyError,
     RevertedError,
     StoreError,
+    TedsProvisionError,
     WrongImageError,
 )
 from teds_provision.firmware_image import FirmwareImage
@@ -33,6 +34,7 @@ from teds_provision.node import virtual
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
 from teds_provision.protocol.session import NodeSession
 from teds_provision.provisioning import image_manager, update
@@ -40,6 +42,7 @@ from teds_provision.provisioning.agree import reset_node
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.image_manager import BoardImage, ImageManager
+from teds_provision.provisioning.parallel import ParallelWork
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.update import UpdateOrder, plan_update, update_at
 from teds_provision.station.firmware import firmware_of
@@ -67,6 +70,7 @@ def test_a_new_image_is_proven_kept_and_nothing_else_changes(bench: UpdateBench,
     flash = bench.node.tim.flash
     done = bench.update(owner.new)
     assert (done.result, done.before, done.octets, done.error) == ("updated", "1.0.0", len(owner.new.octets), None)
+    assert list(bench.details) == ["upload", "restart", "prove"]
     assert bench.details["upload"] == f"{len(owner.new.octets)} octets"
     assert bench.runs == ("1.1.0", False, False)
     assert bench.node.tim.flash == flash
@@ -917,7 +921,7 @@ class _Ports:
             assert (reporter, timeout) == (uuid.hex(), 7.0)
             return uuid, order
 
-        work = update.ParallelWork
+        work = ParallelWork
 
         def parallel(items: Any, one: Any, *, at_once: int, name: str) -> Any:
             self.at_once.append(at_once)
@@ -985,9 +989,9 @@ def test_who_stops_an_update_of_many_boards_begins_no_further_one(monkeypatch: p
     )
     monkeypatch.setattr(update, "ParallelWork", lambda *_args, **_more: work)
     none: Any = None
-    running = update.update_boards(none, LinkSettings(), [(A, none), (B, none)], none, parallel=2)
+    running: Any = update.update_boards(none, LinkSettings(), [(A, none), (B, none)], none, parallel=2)
     assert next(running) == "first"
-    running.close()  # type: ignore[attr-defined]
+    running.close()
     assert dropped == [True]
     assert ports.done[-1] == "close nfc:None"
 
@@ -1060,3 +1064,205 @@ def test_an_update_begins_with_free_actuators_and_a_board_that_runs_the_image_is
     assert known is not None
     assert known.reading.report is not None
     assert known.reading.report.image == owner.old.digest
+
+
+# -- single steps of an update, without a board ------------------------------------------------------------------------
+
+
+def an_update(station: Any = None, **order: Any) -> Any:
+    none: Any = None
+    return update._Update(station, none, 1.0, bytes(10), UpdateOrder(image_of(NEWER), **order), SilentReporter())
+
+
+def test_an_address_that_a_claim_moved_is_made_durable_and_no_other_link_has_one() -> None:
+    sent: list[object] = []
+    for address in (None, 0x42):
+        node: Any = SimpleNamespace(
+            contact=SimpleNamespace(address=address), request=lambda command, _doing: sent.append(command)
+        )
+        an_update()._keep_address(node)
+    assert sent == [security_command(Function.SET_CAN_ADDRESS, b"\x42")]
+
+
+def _identity(state: NodeState = NodeState.PROVISIONED, epoch: int = 3, sequence: int = 4) -> Any:
+    return SimpleNamespace(state=state, epoch=epoch, sequence=sequence)
+
+
+@pytest.mark.parametrize(
+    ("state", "kept", "as_kept", "security", "datasheet"),
+    [
+        (NodeState.PROVISIONED, b"old", False, b"now", "read"),
+        (NodeState.PROVISIONED, b"now", False, b"now", "kept"),
+        (NodeState.PROVISIONED, None, False, b"now", "read"),
+        (NodeState.PROVISIONED, b"old", True, b"old", "kept"),
+        (NodeState.PROVISIONED, None, True, b"now", "read"),
+        (NodeState.KEYED, b"now", False, b"now", None),
+        (NodeState.KEYED, b"old", True, b"now", None),
+    ],
+)
+def test_what_is_noted_before_a_restart_is_of_the_node_unless_it_has_restarted(
+    state: NodeState,
+    kept: bytes | None,
+    as_kept: bool,
+    security: bytes,
+    datasheet: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = None if kept is None else SimpleNamespace(security=kept)
+    monkeypatch.setattr(update, "read_identity", lambda _node: _identity(state))
+    monkeypatch.setattr(update, "read_block", lambda _node, _block: b"now")
+    monkeypatch.setattr(update, "read_image", lambda _node: "read")
+    station = SimpleNamespace(datasheets=SimpleNamespace(datasheet=lambda _uuid: known))
+    node: Any = SimpleNamespace(open_counter=bytes(8))
+    noted = an_update(station)._note(node, as_kept=as_kept)
+    assert noted.security == security
+    assert noted.datasheet is (known if datasheet == "kept" else datasheet)
+
+
+@pytest.mark.parametrize(("known", "noted"), [(None, True), ("no signature", True), ("signed", False)])
+def test_the_firmware_before_an_update_counts_as_that_of_the_signature_if_none_is_known(
+    known: str | None, noted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[bool] = []
+    monkeypatch.setattr(update, "keep_firmware", lambda *_args, signed: kept.append(signed))
+    record = known and SimpleNamespace(signed=RUNS if known == "signed" else None)
+    station = SimpleNamespace(
+        firmware_reports=SimpleNamespace(get=lambda _uuid: record), durable=lambda _by: nullcontext()
+    )
+    an_update(station)._keep_as_signed(reported())
+    assert kept == ([True] if noted else [])
+
+
+ON_TRIAL = reported(NEWER, FirmwareFlag.ON_TRIAL)
+KEEPS = reported(NEWER)
+
+
+@pytest.mark.parametrize(
+    ("first", "identity", "last", "error"),
+    [
+        (ON_TRIAL, _identity(), KEEPS, None),
+        (None, _identity(), KEEPS, "did not start"),
+        (reported(RUNS, FirmwareFlag.ON_TRIAL), _identity(), KEEPS, "did not start"),
+        (KEEPS, _identity(), KEEPS, "confirmed itself"),
+        (ON_TRIAL, _identity(NodeState.KEYED), KEEPS, "lost key, epoch or sequence"),
+        (ON_TRIAL, _identity(epoch=2), KEEPS, "lost key, epoch or sequence"),
+        (ON_TRIAL, _identity(sequence=5), KEEPS, "lost key, epoch or sequence"),
+        (ON_TRIAL, _identity(), None, "did not keep"),
+        (ON_TRIAL, _identity(), reported(RUNS), "did not keep"),
+        (ON_TRIAL, _identity(), ON_TRIAL, "did not keep"),
+    ],
+)
+def test_each_thing_that_a_new_image_proves_is_looked_at(
+    first: Any, identity: Any, last: Any, error: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only then it is kept: the confirmation comes after every look but the last."""
+    reports, did = [last, first], list[str]()
+    monkeypatch.setattr(update, "read_about", lambda _node: reports.pop())
+    monkeypatch.setattr(update, "prove", lambda _node, _point: did.append("prove"))
+    monkeypatch.setattr(update, "read_block", lambda _node, _block: b"sheet")
+    monkeypatch.setattr(update, "read_identity", lambda _node: identity)
+    monkeypatch.setattr(update, "require_working_hardware", lambda _node, _sheet: did.append("hardware"))
+    made = an_update()
+    made._keep = lambda report: did.append(f"keep {report.image.hex()[:2]}")
+    manager: Any = SimpleNamespace(confirm=lambda: did.append("confirm"))
+    none: Any = None
+    before = update._BeforeRestart(b"sheet", _identity(), none if error else "datasheet", None)  # type: ignore[arg-type]
+    if error is None:
+        made._prove(none, manager, before)
+        assert did == ["prove", "hardware", "confirm", "keep 02"]
+        return
+    with pytest.raises(TedsProvisionError, match=error):
+        made._prove(none, manager, before)
+    assert ("confirm" in did) == (error == "did not keep")
+    assert "keep 02" not in did
+
+
+class _Returns:
+    """What comes of each session with a board after its restart: an error, or its report and c."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, made: Any, *sessions: Any) -> None:
+        self.left, self.restarts, self.closed = list(sessions), 0, 0
+        made._in_session = self.session
+        patch.setattr(update, "_PAUSE", 0)
+        patch.setattr(update, "read_about", lambda node: node.report)
+        patch.setattr(update, "ImageManager", lambda _node: SimpleNamespace(restart=self.restart))
+
+    @contextmanager
+    def session(self, _seconds: float) -> Iterator[Any]:
+        now = self.left.pop(0)
+        if isinstance(now, Exception):
+            raise now
+        report, c = now
+        yield SimpleNamespace(report=report, open_counter=c.to_bytes(8, "big"))
+
+    def restart(self) -> None:
+        self.restarts += 1
+        if self.restarts == 1:
+            raise NodeRefusedError("It is busy.", reason=17)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_a_board_whose_image_is_not_proven_is_waited_for_until_its_old_one_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A board that refuses the restart, is silent, busy, or reports nothing yet, is asked again."""
+    later, old = 1 << 40, reported()
+    made = an_update(wait=60.0)
+    board = _Returns(
+        monkeypatch,
+        made,
+        NodeSilentError("It is silent."),
+        SessionLostError(NodeSilentError("It is silent.")),
+        NodeRefusedError("It is busy.", reason=17),
+        (None, later),
+        (ON_TRIAL, 1),
+        (ON_TRIAL, later),
+        (old, later),
+    )
+    node: Any = SimpleNamespace(open_counter=bytes(8), contact=SimpleNamespace(link=SimpleNamespace(close=board.close)))
+    with pytest.raises(RevertedError, match="did not prove itself: It is harmful"):
+        made._revert(node, PolicyError("It is harmful."))
+    assert (board.left, board.restarts, board.closed) == ([], 2, 1)
+    board.left, board.restarts = [LinkClosedError("Ctrl-C")], 1
+    with pytest.raises(LinkClosedError):
+        made._revert(node, PolicyError("It is harmful."))
+
+
+def test_a_restarted_board_is_waited_for_while_it_is_silent_or_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    later = 1 << 40
+    made = an_update(wait=60.0)
+    before = update._BeforeRestart(b"", _identity(), None, bytes(8))
+    board = _Returns(
+        monkeypatch,
+        made,
+        NodeSilentError("It is silent."),
+        NodeRefusedError("It is busy.", reason=17),
+        (ON_TRIAL, 1),
+        (ON_TRIAL, later),
+    )
+    with made._restarted(before) as node:
+        assert node.open_counter == later.to_bytes(8, "big")
+    assert (board.left, board.restarts) == ([], 0)
+    board.left = [LinkClosedError("Ctrl-C")]
+    with pytest.raises(LinkClosedError), made._restarted(before):
+        pass
+
+
+def test_a_board_is_looked_for_two_seconds_at_a_time_within_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[float] = []
+    made = an_update()
+
+    @contextmanager
+    def meeting(seconds: float) -> Iterator[Any]:
+        looked.append(seconds)
+        yield SimpleNamespace(uuid=bytes(10))
+
+    made._meeting = meeting
+    monkeypatch.setattr(update, "open_session", lambda _station, _node: None)
+    monkeypatch.setattr(update, "unknown_key", lambda _station, _node: PolicyError("Its key is unknown."))
+    for left in (60.0, 0.5):
+        with pytest.raises(PolicyError, match="unknown"), made._in_session(left):
+            pass
+    assert looked == [2.0, 0.5]
