@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from teds_provision import plant
 from teds_provision.cli.rendering import local_time as local
 from teds_provision.errors import UsageError
+from teds_provision.links import LinkSettings
 from teds_provision.plant.commands import line as commands
+from teds_provision.plant.commands.provision import LineOptions
 from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import take_job
+from teds_provision.plant.line import LineRun, Scans
 from teds_provision.plant.yield_stats import Attempt, StationYield, to_csv, yield_stats
 from teds_provision.protocol.keys import station_key_message
 from teds_provision.protocol.plant.job import open_job
 from teds_provision.protocol.plant.roster import Member
+from teds_provision.provisioning.batch import ProvisionRequest
 from teds_provision.station.plant.line import EvidenceRow, JobRow, UnitRow
 from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call
+from tests.pace import PATIENCE
 
 from .owner import ANGLE, alone, job_of, join, roster_of
 
@@ -407,3 +415,111 @@ def test_a_dry_run_of_an_export_of_evidence_makes_no_folder(home: Path, tmp_path
         assert not folder.exists()
         assert export(station, [], folder) == {}
         assert folder.is_dir()
+
+
+# -- what a run of provision is made of --------------------------------------------------------------------------------
+
+
+def begun(
+    station: Station, monkeypatch: pytest.MonkeyPatch, *, sign: str = "station", report: bool = False, **given: Any
+) -> tuple[LineRun | None, list[Any]]:
+    """Begin a run with these options; return its line, and which office it asks, by which way."""
+    offices: list[Any] = []
+    office = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr(
+        plant.sign_requests, "JoinedOffice", lambda _base, wait: offices.append(("joined", wait)) or office
+    )
+    monkeypatch.setattr(plant.sign_requests, "transport_for", lambda _base, files: files)
+    monkeypatch.setattr(
+        plant.sign_requests, "RemoteOffice", lambda _base, files, wait: offices.append((files, wait)) or office
+    )
+    if given.get("job") is not None:
+        given["job"] = take_job(station, job_of(station, sign=sign)).id
+    none: dict[str, Any] = dict.fromkeys(("job", "calibrations", "files", "only", "label_to", "operator"))
+    options = LineOptions(**none | {"label_format": "svg", "scan": False, "evidence": False} | given)
+    app: Any = SimpleNamespace(note=print, closing=offices.append)
+    request = ProvisionRequest(report=Path("day.csv") if report else None)
+    line = options.begin(app, station, request, LinkSettings(timeout=7.0))
+    assert (line is None or line.office is None) == (offices == [])
+    if line is not None and line.office is not None:
+        assert (line.office, offices.pop()) == (office, office.close)
+    return line, offices
+
+
+def test_a_run_has_what_its_options_say(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened(home) as station:
+        assert begun(station, monkeypatch) == (None, [])
+        assert begun(station, monkeypatch, operator="Ada", report=True) == (None, []), "the report names who worked"
+        line, _ = begun(station, monkeypatch, evidence=True, operator="Ada", label_to=tmp_path, label_format="png")
+        assert line is not None
+        assert (line.job, line.operator, line.label_to, line.only_verify) == (
+            None, "Ada", tmp_path / "label.png", False
+        )  # fmt: skip
+        line, _ = begun(station, monkeypatch, job="x", only="verify", calibrations=tmp_path)
+        assert line is not None
+        assert line.job is not None
+        assert (line.only_verify, line.calibrations, line.label_to, line.scans) == (True, tmp_path, None, None)
+
+
+@pytest.mark.parametrize("job", ["x", None])
+def test_a_scanner_is_read_beside_the_run(home: Path, monkeypatch: pytest.MonkeyPatch, job: str | None) -> None:
+    read = threading.Event()
+    monkeypatch.setattr(Scans, "listen", lambda _own: read.set())
+    with opened(home) as station:
+        line, _ = begun(station, monkeypatch, job=job, evidence=job is None, scan=True)
+    assert line is not None
+    assert line.scans is not None
+    assert read.wait(PATIENCE)
+
+
+@pytest.mark.parametrize(
+    ("sign", "files", "asks"),
+    [
+        ("station", None, []),
+        ("own", Path("stick"), []),
+        ("ee" * 32, None, [("joined", 7.0)]),
+        ("ee" * 32, Path("stick"), [(Path("stick"), 7.0)]),
+    ],
+)
+def test_the_office_of_a_job_is_asked_through_the_folder_that_is_named_else_through_the_registry(
+    home: Path, monkeypatch: pytest.MonkeyPatch, sign: str, files: Path | None, asks: list[Any]
+) -> None:
+    with opened(home) as station:
+        by = station.fingerprint if sign == "own" else sign
+        assert begun(station, monkeypatch, job="x", sign=by, files=files)[1] == asks
+
+
+def test_a_board_that_is_adopted_gets_what_no_sheet_or_job_says(home: Path, tmp_path: Path) -> None:
+    (tmp_path / "s.csv").write_text("uuid,name\n8d4d9da65281f7000001,a\n")
+    for words in (("--job", "abcd"), ("--batch", str(tmp_path / "s.csv"))):
+        refused = call(home, "--json", "provision", "--adopt", *words, "--nfc", "udp:localhost:9")
+        assert (refused.code, refused.json["error"]["message"]) == (
+            2, "The sheet or job already defines what each board gets.",
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("output", [True, False])
+def test_a_request_for_a_file_is_written_and_one_that_no_office_answers_is_5(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: bool
+) -> None:
+    asked: list[Any] = []
+
+    def sign_by_office(_station: object, _links: object, order: Any, _reporter: object) -> Any:
+        asked.append(order)
+        raise plant.sign_requests.OfficeSilentError("No answer.", hint="Wait.")
+
+    monkeypatch.setattr(plant.sign_requests, "sign_by_office", sign_by_office)
+    file = tmp_path / "request.jws"
+    words = ("sign", A.hex(), "--by", "office", "--job", "abcd", *(("--output", file) if output else ()))
+    done = call(home, *words)
+    if output:
+        assert (done.code, done.out) == (0, f"Wrote the request to {file}. Wait.\n")
+    else:
+        assert (done.code, "No answer." in done.err) == (5, True)
+    (order,) = asked
+    assert (order.node, order.by, order.job, order.output) == (A.hex(), "office", "abcd", file if output else None)
+    signed = SimpleNamespace(image=SimpleNamespace(uuid=A), sequence=9, reused=True)
+    monkeypatch.setattr(plant.sign_requests, "sign_by_office", lambda *_: signed)
+    assert call(home, "--json", *words).json == {
+        "uuid": A.hex(), "sequence": 9, "signed_by": "office", "reused": True
+    }  # fmt: skip
