@@ -457,13 +457,16 @@ def test_each_parcel_that_waits_is_shown_with_its_reason_and_taken_in(
     monkeypatch.setattr(of_parcels, "import_plan", lambda shown: {"count": 1})
     done = SimpleNamespace(fresh=True)
     monkeypatch.setattr(plant.parcels, "import_parcel", lambda _station, row, _plan: taken.append(row.id) or done)
-    shown = ["Warning: bad: It is none.", "Plan of late.", "Reason for waiting: pages", "Plan of new.",
-             "Reason for waiting: it has just arrived"]  # fmt: skip
+    shown = ["Warning: Parcel bad is refused: It is none.", "Plan of late.", "Reason for waiting: pages",
+             "Plan of new.", "Reason for waiting: it has just arrived"]  # fmt: skip
     plan = call(home, "import-keys", "--received", "--dry-run")
-    assert (plan.err.splitlines(), plan.out, taken) == (shown, "2 parcels.\n", [])
+    assert (plan.err.splitlines(), plan.out) == ([*shown, "Error: It is none."], "2 parcels. 1 parcel refused.\n")
+    assert (plan.code, taken) == (8, [])
     assert call(home, "import-keys", "--received").code == 6
     assert taken == []
-    assert call(home, "import-keys", "--received", "--yes").out == (
-        "2 parcels imported; the receipts leave with the next sync.\n"
-    )
-    assert taken == ["late", "new"]
+    imported = call(home, "--json", "import-keys", "--received", "--yes")
+    assert (imported.code, taken) == (8, ["late", "new"]), "the one that is refused keeps no other out"
+    assert imported.json["refused"] == [{"parcel": "bad", "why": "It is none."}]
+    assert [(one["parcel"], one["why"], one["fresh"]) for one in imported.json["received"]] == [
+        ("late", "pages", True), ("new", "", True)
+    ]  # fmt: skip
