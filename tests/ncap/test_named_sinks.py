@@ -11,6 +11,7 @@ import pytest
 from teds_provision.cli.config_file import brokers_of
 from teds_provision.client import ApiError
 from teds_provision.errors import BadDataError, StoreError, TedsProvisionError, UsageError
+from teds_provision.measure.sinks.foxglove import FoxgloveSink
 from teds_provision.ncap.sinks import DaemonSinks, for_readers, sink_json
 from teds_provision.station.store.records import KeptMeasurement
 from tests.e2e.desk import Desk
@@ -224,3 +225,52 @@ def test_files_of_the_service_have_its_units_and_its_topics(
     for spec in ("/r/run.csv", "/r/run.mcap", "ros2"):
         made.open(spec)
     assert specs == opened
+
+
+def test_what_a_request_may_name_is_in_the_refusal_and_an_extension_may_be_in_capitals(tmp_path: Path) -> None:
+    sinks = DaemonSinks(tmp_path, ("mqtt://first", "mqtts://second"), actuators=True, brokers={"lab": LAB})
+    with pytest.raises(UsageError) as caught:
+        sinks.whole("other")
+    assert caught.value.hint == (
+        "Use lab, mqtt, ros1, ros2, or a file name in .csv, .txt, .jsonl, .mcap. Brokers: config.toml, [ncap.brokers]"
+    )
+    assert sinks.whole("RUN.CSV") == str(tmp_path / "recordings" / "RUN.CSV")
+    assert sinks.whole("a" * 77 + ".csv").endswith("a.csv")
+    with pytest.raises(UsageError):
+        sinks.whole("a" * 78 + ".csv")
+    assert sinks.open("mqtt").name == "mqtt://first", "the first of several"
+    own = sinks.extra_sinks(KeptMeasurement("m", sinks=("mqtt",)), None)
+    assert [sink.name for sink in own] == ["mqtts://second"]
+
+
+@pytest.mark.parametrize("spec", ["mqtt://user:secret@own", "mqtt://", "run.xyz"])
+def test_a_malformed_sink_ends_the_start_and_not_the_first_measurement(tmp_path: Path, spec: str) -> None:
+    with pytest.raises(UsageError):
+        DaemonSinks(tmp_path, (spec,), actuators=True)
+
+
+@pytest.mark.parametrize("scalars", [True, False])
+def test_the_services_foxglove_publishes_each_measurement_and_ends_with_none(tmp_path: Path, scalars: bool) -> None:
+    server: Any = SimpleNamespace()
+    sinks = DaemonSinks(tmp_path, actuators=True, foxglove=server, scalars=scalars)
+    [sink] = sinks.extra_sinks(KeptMeasurement("m"), None)
+    assert isinstance(sink, FoxgloveSink)
+    assert (sink.server, sink._own, sink._with_scalars) == (server, False, scalars)
+
+
+def test_set_points_of_each_sink_come_to_the_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[tuple[str, Any]] = []
+    monkeypatch.setattr("teds_provision.ncap.sinks.open_sink", lambda spec, take=None: given.append((spec, take)))
+    sinks = DaemonSinks(tmp_path, ("ros2",), actuators=True)
+    given.clear()
+    take: Any = object()
+    sinks.open("ros1", take)
+    sinks.extra_sinks(KeptMeasurement("m"), take)
+    assert given == [("ros1", take), ("ros2", take)]
+
+
+def test_readers_see_no_folder_user_or_file_of_a_broker_however_deep_it_stands() -> None:
+    found = for_readers(
+        {"a": [{"b": ("mqtts://lab?ca=/etc/ca.pem", "mqtt://arm@lab"), "c": None, "d": 5}], "e": "at /home/me/run.csv."}
+    )
+    assert found == {"a": [{"b": ["mqtts://lab", "mqtt://lab"], "c": None, "d": 5}], "e": "at run.csv."}

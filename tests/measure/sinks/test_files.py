@@ -29,9 +29,24 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError, TedsProvisionError, UsageError
-from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, GroupRows, NodeReport, StationFacts
-from teds_provision.measure.sinks import files, open_sink
+from teds_provision.errors import (
+    BadDataError,
+    NotFoundError,
+    StoreError,
+    StoreLockedError,
+    TedsProvisionError,
+    UsageError,
+)
+from teds_provision.measure.blocks import (
+    Block,
+    ChannelFacts,
+    ClockSet,
+    GroupRows,
+    InvalidValues,
+    NodeReport,
+    StationFacts,
+)
+from teds_provision.measure.sinks import ThreadedSink, as_sink_failure, files, json_events, open_sink
 from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
 from teds_provision.measure.sinks.mcap.recover import recover
@@ -39,6 +54,8 @@ from teds_provision.measure.sinks.mcap.writer import MAGIC, McapSummary, text
 from teds_provision.measure.sinks.mcap.writer import record as mcap_record
 from teds_provision.measure.sinks.mcap.zstandard_frames import compress_frame
 from teds_provision.measure.sinks.text import TextSink
+from teds_provision.measure.sinks.wide import WideSink
+from teds_provision.teds.units import parse_units
 from tests.cli.shell import call, unmeasured_environment
 from tests.faults.disk import build_library, put_back
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks, fill
@@ -777,13 +794,14 @@ def test_a_wide_file_of_another_datasheet_is_a_part_of_its_own(tmp_path: Path) -
     path = tmp_path / "run.csv"
     sink = open_sink(f"wide:{path}")
     sink.open([ANGLE], STATION)
-    for facts in ([ANGLE], [ANGLE], [replace(ANGLE, fingerprint="ef" * 32)]):
+    other = replace(ANGLE, fingerprint="ef" * 32)
+    for facts in ([ANGLE], [ANGLE], [other], [other]):
         sink.describe(facts)
         value = np.array([[1.0], [2.0]])
         sink.write_group(GroupRows("crane", (ANGLE.key,), np.array([0.0, 1.0]) + 1_795_000_000.0, value, 0 * value))
     sink.close()
     assert sink.files == (str(path), str(tmp_path / "run.2.csv"))
-    assert [len(rows(Path(name).read_text())) for name in sink.files] == [4, 2]
+    assert [len(rows(Path(name).read_text())) for name in sink.files] == [4, 4]
 
 
 def test_a_part_goes_to_the_disk_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -911,3 +929,392 @@ def test_a_line_by_a_datasheet_that_is_not_signed_is_marked(tmp_path: Path, mark
     second = replace(ANGLE, number=2, name="other", **marks)
     record(tmp_path / "run.csv", [block([[1, 2]], channels=(1, 2))], facts=[ANGLE, second])
     assert [row["note"] for row in rows((tmp_path / "run.csv").read_text())] == [note]
+
+
+def test_values_are_in_the_file_after_a_tenth_of_a_second_and_not_only_on_the_disk_after_one(tmp_path: Path) -> None:
+    part = Part(tmp_path / "run.csv")
+    part.add(b"first\n", 3)
+    began = part._flushed
+    part.look(began + 0.09)
+    assert (tmp_path / "run.csv").read_bytes() == b""
+    part.look(began + 0.11)
+    assert (tmp_path / "run.csv").read_bytes() == b"first\n"
+    part.add(b"x" * ((1 << 18) - 1))
+    assert part.size == 6
+    part.add(b"y")
+    assert part.size == 6 + (1 << 18), "a quarter of a mebibyte does not wait"
+    part.add(b"lost\n", 7)
+    part.lost = 2
+    assert part.abandon() == 9, "what is not in the file, whether it was tried or still waits"
+
+
+def test_each_part_ends_with_the_counts_of_its_nodes_and_the_next_begins_with_them(tmp_path: Path) -> None:
+    """Since the counters of a measurement run on; and what happened to the clock is in both, each by its own time."""
+    sink = at_hand(tmp_path / "run.csv")
+    sink._guarded_item(block())
+    sink._guarded_item(NodeReport(ARM, "running", samples=3, lost=1, late=2, bad=4, invalid=5, time=1_795_000_001.0))
+    sink._guarded_item(ClockSet(1_795_000_100.0, -50.0))
+    sink._finish()
+    first, second = (Path(name).read_text().splitlines() for name in sink.files)
+    counts = f"{ARM} running: 3 values, lost 1, late 2, bad 4, invalid 5"
+    news = "The system clock was set back by 50.000 s; earlier times follow the old clock."
+    assert [line[2:] for line in first[-2:]] == [
+        f"2026-11-18T11:09:10.000Z {news}", f"2026-11-18T11:06:41.000Z {counts}"
+    ]  # fmt: skip
+    head = next(place for place, line in enumerate(second) if line.startswith("time,"))
+    assert [line[2:] for line in second[head + 1 :]] == [
+        f"2026-11-18T11:06:41.000Z {counts}", f"2026-11-18T11:08:20.000Z {news}"
+    ]  # fmt: skip
+    assert (first[2], second[2]) == (
+        "# started: 2026-11-18T11:06:40.000Z; part 1", "# started: 2026-11-18T11:05:50.000Z; part 2"
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gaps", "message"),
+    [
+        (["one."], "run.csv has 1 gap. one."),
+        (["one.", "two."], "run.csv has 2 gaps. one. two."),
+        (["one.", "two.", "three.", "four."], "run.csv has 4 gaps. two. three. four."),
+    ],
+)
+def test_a_recording_with_gaps_ends_with_an_error_that_names_the_last_three(
+    tmp_path: Path, gaps: list[str], message: str
+) -> None:
+    sink = at_hand(tmp_path / "run.csv")
+    sink._gaps = gaps
+    with pytest.raises(StoreError) as caught:
+        sink._finish()
+    assert (caught.value.message.replace(f"{tmp_path}/", ""), caught.value.hint) == (
+        message, "Free some space before the next run; what was written is intact."
+    )  # fmt: skip
+
+
+def test_a_recording_that_ends_on_a_full_disk_says_since_when_and_leaves_no_empty_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sink = TextSink(tmp_path / "run.csv")
+    sink._prepare((ANGLE,), STATION)
+    sink._count(dropped=4)
+    sink._wait_for_room(OSError(errno.ENOSPC, "x"))
+    assert (sink.files, list(tmp_path.iterdir())) == ((), []), "a part without a whole line is none"
+    assert re.fullmatch(
+        r"The disk is full since \S+: nothing is recorded until space is free\.", sink.stats.detail
+    )  # fmt: skip
+    sink._guarded_item(block())
+    with pytest.raises(StoreError, match=r"has 1 gap\. The disk is full since \S+: 3 values are not recorded\."):
+        sink._finish()
+
+
+@pytest.mark.parametrize(
+    ("number", "message", "hint", "code"),
+    [
+        (errno.ENOSPC, "the disk is full.", "Free some space; everything written so far is intact.", 7),
+        (errno.EDQUOT, "the disk quota is used up.", "Free some space; everything written so far is intact.", 7),
+        (errno.EFBIG, "the file cannot grow any further.", "Record to another disk, or in shorter runs.", 7),
+        (errno.EACCES, "permission denied.", "Check the owner and mode of the folder.", 7),
+        (errno.EROFS, "the disk is read-only.", "Record to another disk.", 7),
+        (errno.EIO, "Input/output error.", "Check the path.", 7),
+        (errno.ENOENT, "its folder is not there.", "Create the folder first.", 3),
+    ],
+)
+def test_what_a_disk_refused_is_said_with_its_remedy(number: int, message: str, hint: str, code: int) -> None:
+    error = as_sink_failure(OSError(number, os.strerror(number)), "run.csv")
+    assert (error.message, error.hint, error.exit_code) == (f"run.csv cannot be written: {message}", hint, code)
+
+
+def test_a_recorder_holds_two_million_values_and_ends_with_one_more(tmp_path: Path) -> None:
+    sink = TextSink(tmp_path / "run.csv")
+    sink._put((ANGLE,), 2_000_000)
+    assert sink.stats.state == "starting"
+    sink._put((ANGLE,), 1)
+    stats = sink.stats
+    assert (stats.state, stats.dropped) == ("failed", 0)
+    assert stats.error == (
+        f"The disk is too slow: {tmp_path}/run.csv owes 2000000 values. The recording has ended."
+    )  # fmt: skip
+    sink._set_state("running")
+    assert sink.stats.state == "failed", "a failure stays"
+
+
+@pytest.mark.parametrize("suffix", ["csv", "jsonl", "mcap"])
+def test_a_sink_of_a_file_counts_values_and_octets(tmp_path: Path, suffix: str) -> None:
+    sink = open_sink(str(tmp_path / f"run.{suffix}"))
+    sink.open((ANGLE,), STATION)
+    fill(sink, [block([[1, 2], [3, 4]], channels=(1, 2))])
+    assert (sink.stats.written, sink.stats.dropped) == (4, 0)
+    written = sum(Path(name).stat().st_size for name in sink.files)
+    assert written == sink.stats.octets or suffix == "mcap"
+    assert sink.stats.octets > 0
+
+
+def test_the_head_of_a_text_says_what_it_is(tmp_path: Path) -> None:
+    station = replace(STATION, group="", test_pattern=True)
+    twin = replace(FORCE, node="arm", name="angle", unit="")
+    unnamed = replace(FORCE, uuid="f" * 20, node="", name="", number=4, unit="")
+    record(tmp_path / "run.csv", [block(test_pattern=True)], facts=[ANGLE, twin, unnamed], station=station)
+    lines = (tmp_path / "run.csv").read_text().splitlines()
+    assert lines[:5] == [
+        "# teds-provision measurement, text 1; times are unix seconds, "
+        "clock: host's wall clock, node ticks mapped to it",
+        "# station: bench; group: none",
+        "# started: 2026-11-18T11:06:40.000Z; part 1",
+        "# units: SI",
+        "# TEST PATTERN: no line of this file is a measurement",
+    ]
+    [head] = [line.split(",") for line in lines if line.startswith("time,")]
+    names = [f"arm/angle {ARM}:1", f"arm/angle {HAND}:2", f"{'f' * 20}/{unnamed.label}"]
+    assert head[5:] == [f"{names[0]} [rad]", *names[1:], *(f"{name} raw" for name in names)]
+    assert [row["note"] for row in rows("\n".join(lines))] == ["test pattern"] * 3
+
+
+@pytest.mark.parametrize(
+    ("sink", "words"),
+    [("run.csv", "as shown to people; each channel states the way to SI"), ("run.jsonl", "shown")],
+)
+def test_a_file_in_display_units_says_so(tmp_path: Path, sink: str, words: str) -> None:
+    shown = open_sink(f"shown:{tmp_path / sink}")
+    shown.open((replace(ANGLE, units=parse_units("rad")),), STATION)
+    fill(shown, [block()])
+    text = (tmp_path / sink).read_text()
+    assert (f"# units: {words}\n" in text) or (f'"units":"{words}"' in text.splitlines()[0])
+    assert '"si_unit": "rad"' in text or '"si_unit":"rad"' in text
+
+
+def test_the_lines_of_a_json_recording_are_held_whole(tmp_path: Path) -> None:
+    facts = [replace(ANGLE, unsigned=True), replace(FORCE, unverified=True)]
+    invalid = block([[1.5], [2.5]], [[0.5], [7.0]], [[True], [False]], index=7, clock_error=None)
+    record(
+        tmp_path / "run.jsonl",
+        [
+            replace(invalid, age=0.0123456789, test_pattern=True),
+            block([[b"\x01\xff"]], [[1.0]], uuid=HAND, channels=(2,)),
+            NodeReport(
+                ARM, "lost", "no frame", samples=9, lost=1, late=2, bad=3, invalid=4, clock_error=0.5, time=6.5,
+                invalid_why=(InvalidValues(1, "above", 4),),
+            ),
+        ],
+        facts=facts,
+        station=replace(STATION, instance="another", test_pattern=True),
+    )  # fmt: skip
+    head, first, second, data, hand, status = map(json.loads, (tmp_path / "run.jsonl").read_text().splitlines())
+    assert head == {
+        "event": "recording", "format": "teds-provision/measurement-1", "station": "bench", "group": "crane",
+        "started": "2026-11-18T11:06:40.000Z", "clock": "host's wall clock, node ticks mapped to it",
+        "test_pattern": True, "units": "si",
+    }  # fmt: skip
+    assert [(line["event"], line["uuid"], line["number"]) for line in (first, second)] == [
+        ("channel", ARM, 1), ("channel", HAND, 2)
+    ]  # fmt: skip
+    assert (first["low"], "vector" in first, "overdue" in first, "due" in second) == (0.0, False, False, False)
+    assert data == {
+        "event": "data", "uuid": ARM, "channel": 1, "name": "angle", "unit": "rad", "index": 7,
+        "time": [1_795_000_000.07, 1_795_000_000.08], "raw": [1.5, 2.5], "value": [0.5, None], "uncertainty": 0.0087,
+        "valid": [True, False], "clock_error": None, "age": 0.012346, "test_pattern": True, "unsigned": True,
+    }  # fmt: skip
+    assert (hand["raw"], hand["unverified"], "unsigned" in hand) == (["01ff"], True, False)
+    assert status == {
+        "event": "status", "uuid": ARM, "state": "lost", "why": "no frame", "samples": 9, "lost": 1, "late": 2,
+        "bad": 3, "invalid": 4, "invalid_why": [{"channel": 1, "why": "above", "count": 4}], "clock_error": 0.5,
+        "time": 6.5,
+    }  # fmt: skip
+
+
+def test_notes_that_come_before_the_first_row_of_a_wide_file_are_in_its_head(tmp_path: Path) -> None:
+    sink = WideSink(tmp_path / "run.csv")
+    sink._prepare((ANGLE,), STATION)
+    sink._begin()
+    sink._guarded_item(NodeReport(ARM, "running", samples=3, time=1_795_000_001.0))
+    sink._guarded_item(ClockSet(1_795_000_100.0, 50.0))
+    value = np.array([[1.5], [np.nan]])
+    times = np.array([1_795_000_000.125, 1_795_000_000.25])
+    sink._guarded_item(GroupRows("crane", (), times, np.zeros((2, 0)), np.zeros((2, 0))))
+    sink._guarded_item(GroupRows("crane", (ANGLE.key,), times, value, 0 * value))
+    sink._guarded_item(GroupRows("crane", (ANGLE.key, FORCE.key), times[:1], np.array([[1.0, 2.0]]), np.zeros((1, 2))))
+    sink._finish()
+    first, second, third = (Path(name).read_text().splitlines() for name in sink.files)
+    assert first[-1] == f"# 2026-11-18T11:06:41.000Z {ARM} running: 3 values, lost 0, late 0, bad 0, invalid 0"
+    head = next(place for place, line in enumerate(second) if line.startswith("time,"))
+    assert second[head:] == [
+        "time,arm/angle [rad]",
+        f"# 2026-11-18T11:06:41.000Z {ARM} running: 3 values, lost 0, late 0, bad 0, invalid 0",
+        "# 2026-11-18T11:08:20.000Z The system clock was set forward by 50.000 s; earlier times follow the old clock.",
+        "1795000000.125000,1.5",
+        "1795000000.250000,",
+    ]
+    assert third[-1] == "1795000000.125000,1,2"
+    assert (sink.stats.written, sink.stats.messages) == (4, 3)
+
+
+def test_each_pause_of_a_full_disk_has_its_own_gap_and_the_part_behind_it_all_that_happened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sink = at_hand(tmp_path / "run.csv")
+    sink._guarded_item(NodeReport(ARM, "running", samples=3, lost=1, time=1_795_000_001.0))
+    sink.part.flush()
+    free = [0]
+    monkeypatch.setattr(os, "statvfs", lambda _place: SimpleNamespace(f_bavail=free[0], f_bfree=1 << 40, f_frsize=1))
+
+    def pause(*news: ClockSet) -> list[str]:
+        """Let the disk be full from within a block, for another one; gives the lines of the next part."""
+        free[0] = 0
+        sink._guarded_item(block())
+        sink._wait_for_room(OSError(errno.ENOSPC, "x"))
+        for item in (*news, block()):
+            sink._guarded_item(item)
+        sink._guarded_idle(sink._tried + 1.0)
+        assert sink.stats.state == "waiting", "of what is free only a part is for everybody"
+        free[0] = 1 << 20
+        sink._guarded_idle(sink._tried + 1.0)
+        assert sink.stats.state == "running"
+        return Path(sink.files[-1]).read_text().splitlines()
+
+    first = pause(ClockSet(1_795_000_100.0, 50.0), ClockSet(1_795_000_200.0, 30.0))
+    assert (sink.stats.written, sink.stats.dropped, len(sink.files)) == (0, 6, 2)
+    head = next(place for place, line in enumerate(first) if line.startswith("time,"))
+    counts, gap, *news = first[head + 1 :]
+    assert counts == f"# 2026-11-18T11:06:41.000Z {ARM} running: 3 values, lost 1, late 0, bad 0, invalid 0"
+    assert re.fullmatch(r"# \S+ The disk was full from \S+ to \S+: 6 values are not recorded\.", gap)
+    assert [line.partition("set ")[2][:20] for line in news] == ["forward by 50.000 s;", "forward by 30.000 s;"]
+    assert re.fullmatch(r"The disk was full from \S+ to \S+: 6 values are not recorded\.", sink.stats.detail)
+    second = pause()
+    assert not [line for line in second if "clock was set" in line], "that was said"
+    assert sink.stats.dropped == 12
+    with pytest.raises(StoreError, match=r"has 2 gaps\. The disk was full .*: 6 values .* full .*: 6 values are not"):
+        sink._finish()
+
+
+@pytest.mark.parametrize(("number", "goes_on"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, False)])
+def test_a_disk_that_is_full_again_at_the_next_part_is_waited_for_and_a_broken_one_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, goes_on: bool
+) -> None:
+    sink = at_hand(tmp_path / "run.csv")
+    sink._wait_for_room(OSError(errno.ENOSPC, "x"))
+
+    def fails(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Part, "flush", fails)
+    if goes_on:
+        sink._guarded_idle(sink._tried + 1.0)
+        assert (sink.stats.state, sink.files, sink._gaps) == ("waiting", (), [])
+    else:
+        with pytest.raises(OSError, match="Input/output"):
+            sink._guarded_idle(sink._tried + 1.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_facts_before_the_first_value_begin_no_other_part_and_why_values_are_invalid_is_said(tmp_path: Path) -> None:
+    """A name with a comma is one cell; octets are hex; a float keeps every digit."""
+    odd = replace(ANGLE, node="arm, left", sample_form="float, 8 octets")
+    bare = replace(FORCE, number=3, name="octets", unit="")
+    why = (InvalidValues(1, "above its high limit", 2),)
+    files_made = record(
+        tmp_path / "run.csv",
+        [
+            [odd], [bare],
+            block([[0.1234567890123456]], [[0.5]]),
+            block(np.array([[b"\x01\xff"]], dtype=object), [[1.0]], uuid=HAND, channels=(3,)),
+            NodeReport(ARM, "ended", samples=1, invalid=2, invalid_why=why, time=1_795_000_001.0),
+        ],
+        facts=[],
+    )  # fmt: skip
+    assert [Path(name).name for name in files_made] == ["run.csv"]
+    text = (tmp_path / "run.csv").read_text()
+    assert '"arm, left/angle [rad]"' in text
+    first, second = rows(text)
+    assert (float(first["arm, left/angle raw"]), second["hand/octets raw"]) == (0.1234567890123456, "01ff")
+    assert text.splitlines()[-1] == (
+        f"# 2026-11-18T11:06:41.000Z {ARM} ended: 1 values, lost 0, late 0, bad 0, invalid 2"
+        " (2 of channel 1: above its high limit)"
+    )
+
+
+def test_a_part_is_on_the_disk_when_it_is_closed_and_readable_by_all_and_none_is_left_that_could_not_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part, sizes = Part(tmp_path / "run.csv"), list[int]()
+    part.add(b"last\n")
+    monkeypatch.setattr(os, "fsync", lambda file: sizes.append(os.fstat(file).st_size))
+    before = os.umask(0)
+    try:
+        part.close()
+        with Part(tmp_path / "other.csv").path.open() as file:
+            assert os.fstat(file.fileno()).st_mode & 0o777 == 0o644
+    finally:
+        os.umask(before)
+    assert sizes[0] == 5
+
+    def full(_folder: Path) -> None:
+        raise OSError(errno.ENOSPC, "x")
+
+    monkeypatch.setattr(files, "sync_folder", full)
+    with pytest.raises(OSError, match="x"):
+        Part(tmp_path / "third.csv")
+    assert not (tmp_path / "third.csv").exists()
+
+
+class SlowCarrier(ThreadedSink):
+    """A live sink whose thread is not started; what waits stays."""
+
+    def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
+        """Do nothing."""
+
+    def _process_item(self, item: Any) -> None:
+        """Do nothing."""
+
+    def _finish(self) -> None:
+        raise OSError(errno.EACCES, "x")
+
+
+def test_of_what_waits_for_a_live_sink_the_oldest_values_go_and_facts_and_reports_stay() -> None:
+    sink = SlowCarrier("slow")
+    report, facts = NodeReport(ARM, "running"), (ANGLE,)
+    sink.report(report)
+    sink.describe(facts)
+    for number in range(255):
+        sink.write(block([[number], [number]], index=number))
+    assert (sink.stats.dropped, len(sink._items), sink._owed) == (2, 256, 508)
+    row = np.array([[1.0, 2.0, 3.0]])
+    sink.write_group(GroupRows("crane", (ANGLE.key,) * 3, np.array([1.0]), row, row))
+    assert len(sink._items) == 256, "a sink that has no use for rows gets none"
+    sink.wants_rows = True
+    sink._items[2] = (0.0, 3, GroupRows("crane", (ANGLE.key,) * 3, np.array([1.0]), row, row))
+    sink.write(block([[7]], index=7))
+    assert sink.stats.dropped == 5, "rows count as values do"
+    items = [item for _, _, item in sink._items]
+    assert items[:2] == [report, facts]
+    assert [item.index for item in items[2:4] if isinstance(item, Block)] == [2, 3]
+    assert isinstance(items[-1], Block)
+    assert items[-1].index == 7
+    taken, done = sink._next()
+    assert ([type(item) for item in taken], done) == ([NodeReport], False)
+    sink._fail(TedsProvisionError("It broke.", hint="Mend it."))
+    sink._set_state("running", "better")
+    sink.write(block())
+    assert (sink.stats.state, sink.stats.error, sink.stats.hint) == ("failed", "It broke.", "Mend it.")
+    assert sink._next() == ([], True)
+    assert not sink._items
+
+
+def test_what_the_system_refuses_at_the_end_of_a_sink_is_its_error() -> None:
+    sink = SlowCarrier("slow")
+    sink._end()
+    assert (sink.stats.state, sink.stats.error) == ("failed", "slow cannot be written: permission denied.")
+
+
+def test_lines_of_a_grid_have_no_raw_value_and_null_where_a_value_is_missing() -> None:
+    rows_of_two = GroupRows(
+        "crane", (ANGLE.key, FORCE.key), np.array([1.0000004, 2.0]), np.array([[0.5, np.nan], [np.nan, 7.0]]),
+        np.zeros((2, 2)),
+    )  # fmt: skip
+    first, second = json_events.row_lines(rows_of_two, {ANGLE.key: ANGLE})
+    assert first == {
+        "event": "data", "uuid": ARM, "channel": 1, "name": "angle", "unit": "rad", "time": [1.0, 2.0],
+        "value": [0.5, None], "uncertainty": 0.0087, "valid": [True, False],
+    }  # fmt: skip
+    assert (second["name"], second["unit"], second["uncertainty"], second["valid"]) == ("", "", None, [False, True])
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        json_events.as_line({"value": float("nan")})
+    times = [json_events.iso(seconds) for seconds in (0.0, 1e300, float("nan"))]
+    assert times == ["1970-01-01T00:00:00.000Z", "unknown", "unknown"]
