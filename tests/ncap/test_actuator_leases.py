@@ -479,7 +479,8 @@ def test_a_value_is_sent_again_after_its_pause_and_not_after_its_time(
             held.order = _SetPointOrder(0.75, None, 2)
             assert over(), "another value"
             held.order, held.let_go = _SetPointOrder(0.5, None, 1), True
-            return over()
+            assert over(), "it is let go"
+            return True
 
     monkeypatch.setattr(actuator_leases, "time", SimpleNamespace(monotonic=lambda: 100.0))
     news = cast(Any, News([]))

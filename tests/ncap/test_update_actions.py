@@ -303,8 +303,8 @@ def test_what_fails_as_the_service_ends_is_no_result_and_what_went_well_is(bench
     bench.updates.stop()
     done = [
         Finished("aa" * 10, BoardUpdate(b"", "lost", None, 0, 1.0, LinkError("Closed."))),
-        Finished("bb" * 10, OSError()),
         Finished("cc" * 10, BoardUpdate(b"", "updated", "1.0.0", 512, 2.5)),
+        Finished("bb" * 10, OSError()),
     ]
     bench.updates._follow(action, cast(Any, SimpleNamespace(results=lambda: iter(done))))
     assert [row.result for row in action.rows.values()] == [None, None, "updated"]
@@ -528,7 +528,7 @@ def test_a_record_that_is_none_is_left_out_and_what_is_kept_comes_back_whole(ben
         assert found == action
     good = json.loads((home / FOLDER / "a1.json").read_text())
     for name, text in (
-        ("x", "no JSON"), ("x1", "[]"), ("x2", json.dumps({**good, "format": "ncap-update/2", "id": "x2"})),
+        ("0", "no JSON"), ("x1", "[]"), ("x2", json.dumps({**good, "format": "ncap-update/2", "id": "x2"})),
         ("x3", json.dumps({**good, "more": 1, "id": "x3"})), ("copy", json.dumps(good)),
     ):  # fmt: skip
         (home / FOLDER / f"{name}.json").write_text(text)
