@@ -62,7 +62,7 @@ def test_a_folder_of_recordings_is_where_the_service_was_started(
     sinks = DaemonSinks(tmp_path / "home", record=Path("rec"), actuators=False)
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert sinks.whole("run.csv") == str(tmp_path / "rec" / "run.csv")
-    [own] = sinks.extra_sinks(KeptMeasurement("m", group="arm 1/2"), None)
+    [own] = sinks.extra_sinks(KeptMeasurement("m", group="arm  1/ 2"), None)
     assert own.name.startswith(str(tmp_path / "rec" / "arm_1_2-"))
     assert own.name.endswith(".csv")
     assert not (tmp_path / "home" / "recordings").exists()

@@ -594,6 +594,8 @@ def test_each_board_gets_the_order_that_was_given_for_it(bench: Bench, monkeypat
     image = cast(Any, object())
     assert [bench.updates._update(action, image, uuid).result for uuid in (NODE, OTHER)] == ["updated", "updated"]
     assert given == [(NODE, False, True, 9.0, "running"), (OTHER, True, True, 9.0, "running")]
+    shown = [(facts["uuid"], facts["board"]["state"]) for _, facts in bench.events]
+    assert shown == [(NODE, "running"), (OTHER, "running")]
     [kept] = UpdateFolder(bench.updates._station.home).read()
     assert [row.state for row in kept.rows.values()] == ["running", "running"], "a restart finds it so"
     bench.whitelisted = False
