@@ -81,8 +81,20 @@ def test_a_folder(home: Path, pem: Path) -> None:
     assert (refused.code, refused.json["error"]["code"]) == (6, "refused")
 
 
+@pytest.mark.parametrize("digits", [DIGITS, DIGITS[:32], spoken(DIGITS).upper()])
+def test_a_key_is_trusted_by_the_digits_that_its_owner_read_out_and_by_no_others(
+    home: Path, pem: Path, digits: str
+) -> None:
+    other = digits[:-1] + ("0" if digits[-1] != "0" else "1")
+    refused = call(home, "--json", "trust", "add", "lab", pem, "--fingerprint", other, "--yes")
+    assert (refused.code, refused.json["error"]["code"]) == (6, "other-key")
+    assert call(home, "--json", "trust", "list").json["trusted"] == []
+    added = call(home, "--json", "trust", "add", "lab", pem, "--fingerprint", digits)
+    assert (added.code, added.json["added"]) == (0, 1), "nobody is asked"
+
+
 def test_usage(home: Path, pem: Path) -> None:
-    for words in ([], ["lab"], ["lab", pem, "--from", pem.parent]):
+    for words in ([], ["lab"], ["lab", pem, "--from", pem.parent], ["--from", pem.parent, "--fingerprint", DIGITS]):
         assert call(home, "--json", "trust", "add", *words).code == 2
     assert call(home, "--json", "trust", "add", "lab", pem.parent / "none.pem", "--yes").code == 3
 

@@ -114,3 +114,33 @@ def test_a_home_of_another_user_is_refused_before_anything_is_written(tmp_path: 
     with pytest.raises(StoreError, match="another user"):
         Store.open(home, create=True)
     assert list(home.iterdir()) == []
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
+@pytest.mark.parametrize("name", ["store.sqlite3", "store.sqlite3-wal", "store.sqlite3-shm"])
+@pytest.mark.parametrize("create", [True, False])
+def test_a_file_of_another_user_is_no_part_of_the_store(home: Path, name: str, create: bool) -> None:
+    (home / name).touch()
+    try:
+        os.chown(home / name, 12345, 12345)
+    except PermissionError:
+        pytest.skip("this root may not give a file to another user")
+    with pytest.raises(StoreError, match=f"{name} is not owned by this user"):
+        Store.open(home, create=create)
+    (home / name).unlink()
+    (home / name).mkdir()
+    with pytest.raises(StoreError, match=f"{name} is not owned by this user"):
+        Store.open(home, create=create)
+
+
+@pytest.mark.parametrize(
+    ("mode", "opens"), [(0o700, True), (0o755, True), (0o750, True), (0o720, False), (0o702, False), (0o777, False)]
+)
+def test_a_home_is_closed_to_others_writing(home: Path, mode: int, opens: bool) -> None:
+    home.chmod(mode)
+    if opens:
+        Store.open(home).close()
+    else:
+        with pytest.raises(StoreError, match="Other users can write"):
+            Store.open(home)
+    assert home.stat().st_mode & 0o777 == mode
