@@ -349,3 +349,58 @@ def test_a_reply_to_drive_names_the_run_before_the_octets_of_a_message():
 @pytest.mark.parametrize(("tag", "fits"), [(0, False), (1, True), (21, True), (22, False)])
 def test_type_codes_of_tagged_arguments_are_1_to_21(tag, fits):
     assert arguments._tag_fits(tag, arguments.TAGS.get(tag, 3), "no kind that is listed") is fits
+
+
+@pytest.mark.parametrize(
+    ("octets", "kind", "name", "findings"),
+    [
+        ("020000", "unknown", "", ["not-a-message"]),
+        ("010000", "reply", "Success", []),
+        ("000000", "reply", "Failure", []),
+        ("01000107", "reply", "Success", ["reply-guessed"]),
+        ("00000107", "reply", "Refusal", ["reply-guessed"]),
+        ("01000c" + 12 * "00", "reply", "Reply to Query or Update TEDS", ["reply-guessed"]),
+        ("000101010000", "command", "Query TEDS", ["argument-cut"]),
+        ("00010101000103", "command", "Query TEDS", []),
+        ("000001070000", "command", "Read service-request mask", []),
+        ("000080c80000", "command", "Function 200", ["unknown-function"]),
+        ("00007f010000", "unknown", "", ["not-a-message"]),
+        ("0000017f0000", "command", "Function 127", ["unknown-function"]),
+        ("05c8010000", "network-service", "Service 200, command", []),
+        ("09c8010000", "network-service", "Service 200, command", []),
+        ("08c8010000", "unknown", "", ["not-a-message"]),
+    ],
+)
+def test_a_message_is_what_its_header_and_length_fit(octets, kind, name, findings):
+    """docs/formats.md: a reply has flag 0 or 1; class and function are known or a maker's."""
+    message = decode_message(bytes.fromhex(octets))
+    assert (message.kind, message.name, [finding.code for finding in message.findings]) == (kind, name, findings)
+    assert message.edition == (2024 if kind == "network-service" else 2007)
+
+
+def test_a_function_of_a_maker_is_no_error_and_a_reserved_one_is():
+    def severity(octets):
+        (finding,) = decode_message(bytes.fromhex(octets)).findings
+        return finding.severity, finding.message
+
+    assert severity("000001800000") == ("note", "Function 1.128 is a maker’s own.")
+    assert severity("0000017f0000") == ("error", "Function 1.127 is reserved.")
+    assert severity("0000810c0000") == ("note", "Function 129.12 is a maker’s own.")
+    known = [looks_like_message(bytes.fromhex(octets)) for octets in ("0000810c0000", "0000800c0000", "0000017f0000")]
+    assert known == [True, True, False], "a TEDS is never taken for a reserved function"
+
+
+def test_a_reply_is_read_by_the_command_that_it_answers_and_not_by_another_message():
+    query = decode_message(bytes.fromhex("00010101000103"))
+    reply = bytes.fromhex("01000c" + 12 * "00")
+    read = decode_message(reply, request=query)
+    assert (read.name, read.findings, read.channel, read.function) == ("Reply to Query TEDS", (), 1, 1)
+    command = bytes.fromhex("00010101000103")
+    assert decode_message(command, request=decode_message(reply)).kind == "command"
+
+
+@pytest.mark.parametrize("channel", [-1, 0x10000])
+def test_a_command_goes_to_a_channel_of_a_u16(channel):
+    with pytest.raises(BadDataError, match=f"A channel is a number from 0 to 65535, not {channel}."):
+        compose_command(channel, 1, 7)
+    assert compose_command(0xFFFF, 1, 7) == bytes.fromhex("ffff01070000")

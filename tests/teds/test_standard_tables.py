@@ -536,7 +536,7 @@ def test_other_habits_of_texts_are_read_and_named(
     [
         ([], "A text-based TEDS has at least one Text."),
         ([("Text", {"Text": "a"}), ("NumLang", 1)], "takes Text entries, not NumLang"),
-        ([("Text", "a")], "Text is a mapping with LangCode, Text and Compress."),
+        ([("Text", "a")], "Text is a mapping of field names, or a sequence of"),
         ([("Text", {"Text": "a", "Offset": 1})], "Text is a mapping with LangCode, Text and Compress."),
         ([("Text", {"Text": 1})], "Text holds text or octets, Compress a number."),
         ([("Text", {"Text": "a", "Compress": "0"})], "Text holds text or octets, Compress a number."),

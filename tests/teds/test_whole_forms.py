@@ -387,3 +387,44 @@ def test_what_is_wrong_with_intel_hex_in_whole_words(text: str, message: str) ->
 def test_records_of_intel_hex_are_joined_where_they_touch_and_wrap_at_64_kib() -> None:
     text = ":0100020001FC\n:0100010000FE\n:0100040003F8\n:02FFFF000102FD\n:00000001FF\n"
     assert stretches(text) == [(0, b"\x02\x00\x01"), (4, b"\x03"), (0xFFFF, b"\x01")]
+
+
+def test_the_tedsid_of_a_written_tree_is_the_one_that_it_names() -> None:
+    """docs/formats.md: family, sub-family, version and width are those of the TEDSID; left out, the usual ones."""
+    fields = [{"name": "TCName", "value": "a"}]
+    for named, tedsid in (
+        ({}, "0304000c0101"),
+        ({"edition": 2024}, "030500ff0c0201"),
+        ({"family": 7, "version": 0, "width": 2}, "0304070c0002"),
+        ({"edition": 2024, "family": 9, "subfamily": 3, "version": 5, "width": 1}, "030509030c0501"),
+        ({"framed": False}, "0304000c0101"),
+    ):
+        teds_entry = {"access_code": 12, "fields": fields, **named}
+        (block,) = read_json(json.dumps({"format": "teds/1", "teds": [teds_entry]}))
+        start = 4 if named.get("framed", True) else 0
+        assert block.octets[start : start + len(tedsid) // 2].hex() == tedsid, named
+        attributes = " ".join(f'{name}="{str(value).lower()}"' for name, value in named.items())
+        xml = f'<teds-set xmlns="urn:teds-provision:teds:1"><teds access-code="12" {attributes}>'
+        xml += '<field name="TCName"><text>a</text></field></teds></teds-set>'
+        assert read_xml(xml.encode()) == [block], named
+
+
+def test_a_text_based_teds_has_one_text_of_each_language_in_json_and_xml() -> None:
+    texts = [("Text", {"LangCode": code, "Text": text, "Compress": 0}) for code, text in (("en", "<a/>"), ("de", "ä"))]
+    block = TedsBlock(0, 11, teds.compose(11, texts))
+    (entry,) = json.loads(write_json([block]))["teds"]
+    assert entry["fields"] == [
+        {
+            "name": "Text",
+            "kind": "fields",
+            "fields": [
+                {"type": 20, "name": "LangCode", "kind": "text", "value": code},
+                {"type": 23, "name": "Compress", "kind": "integer", "value": 0},
+                {"name": "Text", "kind": "text", "value": text},
+            ],
+        }
+        for code, text in (("en", "<a/>"), ("de", "ä"))
+    ]
+    assert "octets" not in entry, "the directory follows from them"
+    assert write_xml([block]).count('<field name="Text">') == 4
+    assert read_json(write_json([block])) == read_xml(write_xml([block]).encode()) == [block]

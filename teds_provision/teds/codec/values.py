@@ -338,12 +338,13 @@ def compose_text(head: bytes, pairs: list[tuple[str, object]], encode: Tuples, w
 
 
 def _text(value: object) -> tuple[str, bytes, int]:
-    if not isinstance(value, Mapping) or set(value) - {"LangCode", "Text", "Compress"}:
+    parts = dict(pairs_of("Text", value))
+    if set(parts) - {"LangCode", "Text", "Compress"}:
         raise BadDataError("Text is a mapping with LangCode, Text and Compress.")
-    text, compress = value.get("Text", ""), value.get("Compress", 0)
+    text, compress = parts.get("Text", ""), parts.get("Compress", 0)
     if not isinstance(text, str | bytes) or not isinstance(compress, int):
         raise BadDataError("Text holds text or octets, Compress a number.")
-    return str(value.get("LangCode", "en")), text.encode() if isinstance(text, str) else text, compress
+    return str(parts.get("LangCode", "en")), text.encode() if isinstance(text, str) else text, compress
 
 
 def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., None]) -> tuple[bytes, ...]:
