@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.calibration import fit
-from teds_provision.teds.formats import TedsBlock
+from teds_provision.teds.codec.frame import frame, unframe
+from teds_provision.teds.formats import TedsBlock, lost, read_blocks
 from teds_provision.teds.profile import (
     Profile,
     check,
@@ -285,6 +286,19 @@ def test_a_sample_has_as_many_octets_as_its_model_allows(tmp_path: Path, model: 
     text = re.sub(r"sample = .*", f'sample = {{ model = "{model}", octets = {octets}, bits = 0 }}', GOOD)
     with pytest.raises(BadDataError, match=f"a sample of model {model} has {wanted} octets, not {octets}"):
         load_profile(write(tmp_path, "force", text))
+
+
+def test_a_number_that_is_no_data_model_is_named(tmp_path: Path) -> None:
+    """It ended in an error of Python, also where a profile was made from a datasheet that has it."""
+    with pytest.raises(BadDataError, match=r"channel\.1\.sample\.model: 8 is no data model; unsigned, float32,"):
+        load_profile(write(tmp_path, "force", GOOD.replace('"unsigned"', "8")))
+    assert load_profile(write(tmp_path, "force", GOOD.replace('"unsigned"', "0"))).warnings == ()
+    path = shipped_profiles() / "load-cell.toml"
+    blocks = read_blocks(path.read_bytes(), path=path)
+    (place,) = [number for number, block in enumerate(blocks) if block.access_code == 3]
+    changed = unframe(blocks[place].octets).replace(bytes.fromhex("280100"), bytes.fromhex("28015d"))
+    blocks[place] = blocks[place]._replace(octets=frame(changed))
+    assert "93 is no data model" in lost(blocks, "toml")[0]
 
 
 def test_the_narrower_selection_of_channels_wins(tmp_path: Path) -> None:

@@ -154,7 +154,10 @@ def _sample(section: Section) -> dict[str, object]:
 
 
 def _check_sample(sample: Section, model: int, octets: int, bits: int) -> None:
-    name = next(name for name, code in MODELS.items() if code == model)
+    name = next((name for name, code in MODELS.items() if code == model), None)
+    if name is None:
+        sample.error("model", f"{model} is no data model; {', '.join(MODELS)} are.")
+        return
     low, high = SAMPLE_OCTETS[DataModel(model)]
     if not low <= octets <= high:
         wanted = str(low) if low == high else f"{low} to {high}"
