@@ -385,7 +385,7 @@ def _in_words(error: BaseException, host: str, port: int) -> str:
         reason = error.verify_message or str(error)
         return f"the certificate of {host} does not verify: {reason} (ca=PATH names the CA)"
     if isinstance(error, ssl.SSLError):
-        return f"TLS with {host}:{port} fails: {error.reason or error}"
+        return f"TLS with {host}:{port} fails: {getattr(error, 'reason', None) or error}"
     if isinstance(error, socket.gaierror):
         return f"unknown host {host}"
     if isinstance(error, ConnectionRefusedError):

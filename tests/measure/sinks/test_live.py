@@ -162,26 +162,6 @@ def test_a_stranger_takes_no_name_of_a_node_that_is_known() -> None:
     assert topics.node(HAND) != "arm"
 
 
-@pytest.mark.parametrize(
-    ("name", "topic"),
-    [(name, f"{name}_1") for name in ("array", "teds", "state", "status", "age", "cmd")]
-    + [(name, f"{name}_ch1") for name in ("stream", "imu", "magnetic_field", "wrench")]
-    + [(name, f"{name}_1") for name in ("stream_0", "imu_2", "magnetic_field_12", "wrench_4")]
-    + [(name, name) for name in ("stream_x", "imus", "teds_2", "range")],
-)
-def test_a_channel_with_a_reserved_name_gets_its_number(name: str, topic: str) -> None:
-    topics = Topics(STATION)
-    topics.learn([replace(ANGLE, name=name)])
-    assert topics.channel(ARM, 1) == f"/bench/arm/{topic}"
-
-
-def test_a_group_never_gets_the_topic_of_joints() -> None:
-    groups = ("hand", "", "Joint States", "joint_commands", "joints")
-    assert [Topics(STATION).of_group(group) for group in groups] == [
-        "/bench/hand", "/bench/all", "/bench/joint_states_group", "/bench/joint_commands_group", "/bench/joints",
-    ]  # fmt: skip
-
-
 def test_words_become_plain_letters() -> None:
     assert slug("Drehwinkel (Größe)") == "drehwinkel_grosse"
     assert slug("3. axis") == "n_3_axis"
@@ -251,8 +231,6 @@ def test_a_vector_group_is_one_message_if_its_unit_tells_what_it_is() -> None:
     assert kinds(*(replace(facts, vector=()) for facts in axes("T", 1))) == [], "nobody said that they are one vector"
     assert kinds(*axes("T", 1)[:2], *axes("m/s^2", 1)[2:]) == [], "axes of two units"
     assert kinds(*axes("m/s^2", 1, kind="actuator")) == []
-    four = axes("T", 1) + axes("T", 4)[:1]
-    assert kinds(*(replace(facts, vector=(1, 2, 3, 4)) for facts in four)) == [], "four members are no x, y, z"
 
 
 def test_half_a_vector_is_none() -> None:

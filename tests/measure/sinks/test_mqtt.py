@@ -6,6 +6,7 @@ import json
 import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -546,6 +547,11 @@ def test_a_password_is_the_files_text_without_its_last_line_end(
     assert library.of("username_pw_set") == [(("arm", password), {})]
     _, library = with_library(monkeypatch, "mqtt://arm@lab")
     assert library.of("username_pw_set") == [(("arm", None), {})]
+    (tmp_path / "password").write_bytes(b"x" * (1 << 20))
+    with_library(monkeypatch, f"mqtt://arm@lab?password-file={tmp_path}/password")
+    (tmp_path / "password").write_bytes(b"x" * ((1 << 20) + 1))
+    with pytest.raises(BadDataError, match="larger"):
+        with_library(monkeypatch, f"mqtt://arm@lab?password-file={tmp_path}/password")
     (tmp_path / "password").write_bytes(b"\xff\xfe")
     with pytest.raises(BadDataError, match="is not UTF-8 text"):
         with_library(monkeypatch, f"mqtt://arm@lab?password-file={tmp_path}/password")
@@ -694,6 +700,7 @@ class Refusal:
         (ConnectionResetError(), "lab:7 closed the connection; it may not support TLS (mqtt://)"),
         (OSError(113, "No route to host"), "lab:7 cannot be reached: No route to host"),
         (ValueError("odd"), "lab:7 cannot be reached: odd"),
+        (ssl.SSLError("odd"), "TLS with lab:7 fails: ('odd',)"),
         (Refusal(), "the broker at lab refused: not authorized"),
     ],
 )

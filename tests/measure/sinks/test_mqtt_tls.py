@@ -198,7 +198,7 @@ def test_files_are_regular_small_and_what_they_should_be(tmp_path: Path, authori
     os.mkfifo(pipe)
     huge.write_bytes(b"x" * (1 << 21))
     text.write_text("not a certificate")
-    locked = authority.issue("locked", passphrase=b"secret words")
+    locked, good = authority.issue("locked", passphrase=b"secret words"), authority.issue("good")
     for query, error in (
         (f"password-file={pipe}", BadDataError),
         (f"password-file={huge}", BadDataError),
@@ -206,7 +206,12 @@ def test_files_are_regular_small_and_what_they_should_be(tmp_path: Path, authori
         ("password-file=/dev/zero", BadDataError),
         (f"ca={pipe}", BadDataError),
         (f"ca={text}", BadDataError),
+        (f"ca={huge}", BadDataError),
         (f"ca={authority.file}&cert={pipe}", BadDataError),
+        (f"ca={authority.file}&cert={huge}", BadDataError),
+        (f"ca={authority.file}&cert={good[0]}&key={pipe}", BadDataError),
+        (f"ca={authority.file}&cert={good[0]}&key={huge}", BadDataError),
+        (f"ca={authority.file}&cert={good[0]}&key={tmp_path / 'none'}", NotFoundError),
         (f"ca={authority.file}&cert={text}&key={text}", BadDataError),
         (f"ca={authority.file}&cert={locked[0]}&key={locked[1]}", BadDataError),
     ):
