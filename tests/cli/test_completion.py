@@ -10,8 +10,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import click
 import pytest
+
+from teds_provision.cli import shell_completion
+from teds_provision.protocol.keys import SoftwareKey, to_pem
 
 from .shell import call, clean_environment
 
@@ -134,3 +140,30 @@ def test_names_of_groups_stations_and_files_are_offered_where_they_are_meant(hom
         assert offered(home, f"teds-provision {line}") == [f"file,{line.split()[-1]}"], line
     assert offered(home, "teds-provision profile show accel") == ["plain,accelerometer"]
     assert offered(home, "teds-provision group create lef") == []
+
+
+def test_nodes_are_offered_by_name_and_uuid_and_stations_by_name(home: Path, tmp_path: Path) -> None:
+    other = UUID[:-1] + "1"
+    assert call(home, "whitelist", "add", UUID, "--name", "finger").code == 0
+    assert call(home, "whitelist", "add", other, "--name", "thumb").code == 0
+    for name, number in (("lab", 71), ("lathe", 72), ("mill", 73)):
+        (tmp_path / f"{name}.pem").write_text(to_pem(SoftwareKey(number).point))
+        assert call(home, "trust", "add", name, tmp_path / f"{name}.pem", "--yes").code == 0
+
+    def offers(parameter: click.Parameter, begun: str, command: str = "x") -> list[str]:
+        ctx: Any = SimpleNamespace(
+            find_root=lambda: SimpleNamespace(params={"home": home}), command_path=f"teds-provision {command}"
+        )
+        offer = shell_completion._offer_for(parameter)
+        return [] if offer is None else [item.value for item in offer(ctx, parameter, begun)]
+
+    for name in ("uuid", "uuids", "what", "old", "new", "node", "nodes", "text", "names"):
+        argument = click.Argument([name])
+        assert (offers(argument, "fin"), offers(argument, UUID[:19])) == (["finger"], [UUID, other]), name
+    stations = ["lab", "lathe"]
+    assert offers(click.Argument(["name"]), "la", "trust remove") == stations
+    assert offers(click.Option(["--to", "receivers"]), "la") == stations
+    assert offers(click.Argument(["name"]), "la", "trust add") == []
+    assert offers(click.Option(["--name"]), "fin") == []
+    assert offers(click.Option(["--profile"]), "load-c") == ["load-cell"]
+    assert offers(click.Option(["--extends"]), "load-c") == ["load-cell"]

@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import KeyringUnavailableError, VaultError
-from teds_provision.vault import keyring_vault
+from teds_provision.errors import KeyringUnavailableError, UsageError, VaultError
+from teds_provision.vault import keyring_vault, selection
 from teds_provision.vault.keyring_vault import KeyringVault
 from teds_provision.vault.passphrase import THROWAWAY
-from teds_provision.vault.selection import create_vault, forget_vaults, open_vault
+from teds_provision.vault.selection import create_vault, forget_vaults, open_vault, plan_vault
 
 STORE = "5e" * 16
 GOOD = "four random words here"
@@ -118,6 +118,38 @@ def test_a_forbidden_backend_is_named_in_the_reason(monkeypatch: pytest.MonkeyPa
     vault, why = create_vault(tmp_path, STORE, None, ask, costs=THROWAWAY)
     assert vault.kind == "file"
     assert "keyring.backends.null.Keyring" in why
+
+
+@pytest.mark.parametrize(
+    ("keystore", "file", "works", "planned"),
+    [
+        (None, False, True, ("keyring", "an OS keyring is available")),
+        (None, False, False, ("file", "no OS keyring: it is locked")),
+        (None, True, True, ("file", "the passphrase file already exists")),
+        ("keyring", True, True, ("keyring", "as requested")),
+        ("keyring", False, False, None),
+        ("file", False, True, ("file", "as requested")),
+        ("pkcs11:token=bench", False, False, ("pkcs11:token=bench", "as requested")),
+    ],
+)
+def test_a_plan_chooses_the_keyring_that_works_else_a_passphrase_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keystore: str | None, file: bool, works: bool, planned: Any
+) -> None:
+    def inspect() -> str:
+        if not works:
+            raise KeyringUnavailableError("It is locked.")
+        return "a keyring"
+
+    monkeypatch.setattr(selection.keyring_vault, "inspect", inspect)
+    if file:
+        (tmp_path / "vault.json").write_text("{}")
+    if planned is None:
+        with pytest.raises(KeyringUnavailableError):
+            plan_vault(tmp_path, keystore)
+    else:
+        assert plan_vault(tmp_path, keystore) == planned
+    with pytest.raises(UsageError, match="There is no keystore 'x'"):
+        plan_vault(tmp_path, "x")
 
 
 class MemoryKeyring:
