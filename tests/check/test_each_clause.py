@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
 
-from teds_provision.check import measuring_rules
+from teds_provision.check import measuring_rules, plain_rules
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError
 from teds_provision.check.rule import Rule, RuleResult
 from teds_provision.check.run import _Run
@@ -277,3 +278,13 @@ def test_a_data_message_of_the_test_pattern_has_its_flag_and_the_sample_of_its_c
     for flags, sample, words in ((0x01, "012f", "sets bit 7"), (0x80, "0130", "0130; the test pattern has 012f")):
         with pytest.raises(RuleBrokenError, match=words):
             look(flags, sample)
+
+
+@pytest.mark.parametrize(("octets", "allowed"), [(511, False), (512, True), (4094, True), (4095, False)])
+def test_a_board_takes_512_to_4094_octets(octets: int, allowed: bool) -> None:
+    probe: Any = SimpleNamespace(max_message=octets, refused=lambda *_: "refusal")
+    if allowed:
+        assert plain_rules.max_message(probe) == "refusal"
+        return
+    with pytest.raises(RuleBrokenError, match=f"maxMessage {octets}; 512 to 4094 are allowed"):
+        plain_rules.max_message(probe)
