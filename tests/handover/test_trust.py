@@ -26,13 +26,14 @@ from teds_provision.handover.trust import (
     private_keys,
     read_request,
     remove,
+    require_ca,
     sign_request,
     spoken,
     write_certificate,
 )
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import Handover
+from teds_provision.station.store.records import Handover, TrustRecord
 from tests.bench import make_station
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -352,6 +353,16 @@ def test_what_ends_with_the_trust_in_a_station(north: Station, keys: Path) -> No
     assert plan_removal(north, record).cas == (), "west brought it too"
     ends = plan_removal(north, find_trusted(north, "owner"))
     assert (ends.cas, ends.open) == ((own_ca,), ())
+
+
+def test_the_ca_key_is_this_owners_and_trust_in_it_never_ends(north: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert require_ca(north).point == north.ca
+    own = TrustRecord("own", "ca", north.ca, fingerprint(north.ca))
+    assert plan_removal(north, own).cas == ()
+    for key in (None, SoftwareKey(31)):
+        monkeypatch.setattr(north.vault, "ca", lambda key=key: key)
+        with pytest.raises(PolicyError, match=f"{fingerprint(north.ca)[:16]} is not in this vault"):
+            require_ca(north)
 
 
 def test_a_fingerprint_as_it_is_spoken() -> None:
