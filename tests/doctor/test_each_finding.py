@@ -16,12 +16,20 @@ from typing import Any
 
 import pytest
 
-from teds_provision.doctor import links, machine
+from teds_provision.doctor import fleet, links, machine
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code, intact
-from teds_provision.errors import KeyringUnavailableError, NoReaderError, VaultError
+from teds_provision.errors import (
+    KeyringUnavailableError,
+    NoReaderError,
+    StoreChangedError,
+    StoreError,
+    VaultError,
+    WrongPassphraseError,
+)
 from teds_provision.links.nfc import pcsc_readers
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import StationRecord
+from teds_provision.station.store.row_sample import RowSample
 
 from ..bench import copy_home
 from .test_doctor import plug_in
@@ -512,3 +520,70 @@ def test_settings_are_counted_and_the_first_five_bad_names_shown(system: System)
         path.write_text("".join(f"{name} = 1\n" for name in names))
         assert words(told, "config") == [("failed", f"{path}, {five}{more}", "Fix these lines.")]
     assert words(system, "config")[0][0] == "ok", "names that nobody knows are no fault"
+
+
+# -- seals and firmware ------------------------------------------------------------------------------------------------
+
+CHANGED = "Changed by another program and not trusted: "
+
+
+@pytest.mark.parametrize(
+    ("keystore", "asked", "unlocks", "broken", "result", "why"),
+    [
+        ("file", False, None, 0, "skipped", "Not checked: pins and trust need the vault, and no passphrase was given."),
+        ("pkcs11:token=a", False, None, 0, "skipped", "Not checked: pins and trust need the vault, and no passphrase"),
+        ("keyring", False, None, 0, "ok", "Pins, trust and the station's own CA are unchanged."),
+        ("file", True, None, 0, "ok", "Pins, trust and the station's own CA are unchanged."),
+        ("keyring", False, None, 1, "failed", f"{CHANGED}row 0."),
+        ("file", True, None, 5, "failed", f"{CHANGED}row 0, row 1, row 2, row 3, row 4."),
+        ("file", True, None, 6, "failed", f"{CHANGED}row 0, row 1, row 2, row 3, row 4 …."),
+        ("file", True, StoreChangedError("The CA was changed.", hint="Restore."), 0, "failed", "The CA was changed."),
+        ("file", True, WrongPassphraseError("Wrong.", hint="Again."), 0, "skipped", "Wrong."),
+        ("keyring", False, StoreError("It is locked."), 0, "skipped", "It is locked."),
+    ],
+)
+def test_seals_are_checked_whenever_nobody_has_to_be_asked(
+    system: System, monkeypatch: pytest.MonkeyPatch,
+    keystore: str, asked: bool, unlocks: Exception | None, broken: int, result: str, why: str,
+) -> None:  # fmt: skip
+    closed: list[int] = []
+
+    def unlock() -> None:
+        if unlocks is not None:
+            raise unlocks
+
+    station = SimpleNamespace(
+        identity=SimpleNamespace(keystore=keystore), unlock=unlock, close=lambda: closed.append(1),
+        row_macs=SimpleNamespace(all_broken=lambda _sample: [f"row {number}" for number in range(broken)]),
+    )  # fmt: skip
+    monkeypatch.setattr(fleet, "has_store", lambda _home: True)
+    monkeypatch.setattr(fleet.Station, "open", lambda _home, *, ask: station)
+    finding = one(fleet.seals(replace(system, ask=(lambda _prompt, _confirm: "x") if asked else None)))
+    assert (finding.result, finding.why.startswith(why), closed) == (result, True, [1])
+    if isinstance(unlocks, StoreChangedError):
+        assert finding.fix == "Restore."
+
+
+def test_firmware_that_needs_an_operator_is_counted_by_node(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    states = ("good", "unjudged", "on-trial", "pending", "old", "not-reported", "other")
+    known = {
+        bytes([number]): SimpleNamespace(state=state, changed=state in ("good", "old"))
+        for number, state in enumerate(states)
+    }
+    types: list[Any] = []
+
+    def known_firmware(record: Any, demand: Callable[[], object]) -> Any:
+        types.append(demand())
+        return known.get(record.uuid)
+
+    monkeypatch.setattr(fleet, "known_firmware", known_firmware)
+    monkeypatch.setattr(fleet, "FirmwareDemands", lambda _home: SimpleNamespace(demand_of=lambda profile: profile))
+    records = [SimpleNamespace(uuid=bytes([number])) for number in range(8)]  # the last one reports nothing
+    nodes = {bytes([1]): SimpleNamespace(profile="load-cell")}
+    station: Any = SimpleNamespace(
+        home=system.home, firmware_reports=SimpleNamespace(all=lambda _sample: iter(records)),
+        nodes=SimpleNamespace(get_many=lambda uuids: nodes),
+    )  # fmt: skip
+    odd, changed = fleet._firmware(station, RowSample(full=True))
+    assert (odd, changed) == ([b"\4", b"\5", b"\6"], [b"\0", b"\4"])
+    assert types == [None, "load-cell", *[None] * 6]
