@@ -428,3 +428,17 @@ def test_what_waits_is_taken_in_by_who_brings_too_much(monkeypatch: pytest.Monke
         past.block(block(NOW - 5 + place / 100, [[1.0]], index=place))
         held.append(len(past._waiting))
     assert held == [1, 2, 3, 0, 1]
+
+
+def test_the_rate_is_that_of_the_last_ten_seconds_and_a_value_keeps_seven_digits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("time.time", lambda: NOW)
+    past = History()
+    ramp(past, NOW - 40, 20)
+    for second in range(20):
+        past.block(block(NOW - 20 + second, [[1.234567]] * 5, rate=5.0))
+    history = past.channel_history(NODE, 1, NOW - 600, NOW)
+    assert (history["rate"], history["low"][-1]) == (5.0, 1.234567)
+    recent = past.channel_history(NODE, 1, NOW - 30, NOW + 40, points=3600)
+    assert recent["bin"] == 1.0, "more than a minute was asked for"
