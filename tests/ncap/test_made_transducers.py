@@ -212,7 +212,7 @@ def test_straight_lines_are_for_channels_that_have_a_range_and_no_values_yet(mon
         unit = SimpleNamespace(text="mm", from_si=lambda value: value * 1000.0)
         facts = {"value_problem": "It has no calibration.", "has_range": True, "calibration_problem": "", "unit": unit}
         sample = SimpleNamespace(raw_range=(0, 4095))
-        return SimpleNamespace(number=number, sample=sample, low=0.0, high=0.25, **facts | changed)
+        return SimpleNamespace(number=number, sample=sample, low=0.125, high=0.25, **facts | changed)
 
     def now(zone: Any) -> datetime:
         return datetime(2026, 3, 1, tzinfo=zone)
@@ -230,8 +230,8 @@ def test_straight_lines_are_for_channels_that_have_a_range_and_no_values_yet(mon
     without.sample, unknown.sample.raw_range = None, None
     sheet: Any = SimpleNamespace(channels=[*channels[:4], without, unknown, channels[4]])
     assert virtual.ideal_calibration(sheet) == (
-        '[[calibration]]\nchannel = 1\ndate = 2026-03-01\nunit = "mm"\npoints = [[0, 0.0], [4095, 250.0]]\n'
-        '\n[[calibration]]\nchannel = 7\ndate = 2026-03-01\nunit = "mm"\npoints = [[-5.0, 0.0], [5.0, 250.0]]\n'
+        '[[calibration]]\nchannel = 1\ndate = 2026-03-01\nunit = "mm"\npoints = [[0, 125.0], [4095, 250.0]]\n'
+        '\n[[calibration]]\nchannel = 7\ndate = 2026-03-01\nunit = "mm"\npoints = [[-5.0, 125.0], [5.0, 250.0]]\n'
     )
 
 

@@ -29,6 +29,7 @@ def test_there_is_one_service_for_each_home_and_the_second_hears_which(tmp_path:
         (tmp_path / "ncap.lock").write_text("")
         with pytest.raises(StoreLockedError, match=r"\(pid unknown\)"), DaemonLock(tmp_path):
             pass
+        (tmp_path / "ncap.lock").write_text("4711\n")
         listener.close()
     assert not (tmp_path / "ncap.sock").exists()
     assert (tmp_path / "ncap.lock").read_text() == "", "the pid is another process's by and by"
