@@ -79,3 +79,12 @@ def test_any_printable_label_can_be_expressed(label):
     from urllib.parse import quote
 
     assert Pkcs11Uri.parse(f"pkcs11:token={quote(label, safe='')}{M}").token == label
+
+
+def test_what_people_call_a_token_and_which_module_is_meant() -> None:
+    called = [("token=t;serial=5", "token 't'"), ("serial=5;slot-id=7", "token with the serial number 5"),
+              ("slot-id=7", "token in slot 7"), ("object=key", "token")]  # fmt: skip
+    for attributes, name in called:
+        assert str(Pkcs11Uri.parse(f"pkcs11:{attributes}?module-path=/m.so")) == name
+    with pytest.raises(UsageError, match="Use module-path, not module-name"):
+        Pkcs11Uri.parse("pkcs11:token=t?module-name=softhsm&module-path=/m.so")
