@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.errors import BadDataError, FrozenError, NotFoundError, UsageError
+from teds_provision.station import measurements as rows
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import DetectionMode, Group, KeptMeasurement
 
@@ -151,3 +153,67 @@ def test_of_two_measurements_of_a_group_the_newest_is_continued(station: Station
     assert continued is not None
     assert continued.rate == 200.0
     assert station.measurements.settings_to_continue("foot") is None
+
+
+def test_a_command_counts_while_it_lives_and_the_next_reader_removes_a_dead_one(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alive = {"c1"}
+    monkeypatch.setattr(rows, "OwnerLock", lambda _home, id: SimpleNamespace(is_taken=id in alive))
+    monkeypatch.setattr(rows, "time", SimpleNamespace(time=lambda: 1000.0))
+    kept = [("n", "ncap", None), ("p", "page", 1000.0), ("t", "api:lab", 1000.5), ("c1", "command", None),
+            ("c2", "command", None), ("c3", "command", 2000.0)]  # fmt: skip
+    for day, (id, owner, ends) in enumerate(kept, 1):
+        created = f"2026-10-0{day}T08:00:00Z"
+        station.measurements.keep(KeptMeasurement(id, uuids=(ONE,), owner=owner, ends=ends, created=created))
+
+    def ids(found: list[KeptMeasurement]) -> list[str]:
+        return [one.id for one in found]
+
+    assert ids(station.measurements.lasting()) == ["n", "p", "t"]
+    assert len(station.measurements._rows()) == 6, "who reads them alone removes nothing"
+    assert ids(station.measurements.due()) == ["n", "t"], "one that is past its end is kept, and not measured"
+    assert ids(station.measurements._rows()) == ["n", "p", "t", "c1"]
+    assert ids(station.measurements.of_commands()) == ["c1"]
+    alive.clear()
+    assert ids(station.measurements.all()) == ["n", "p", "t"]
+
+
+def test_a_node_is_in_a_group_in_a_measurement_or_has_a_name(station: Station) -> None:
+    names = station.measurements
+    assert not names.has_node(ONE)
+    station.groups.put(Group("hand", (ONE,)))
+    names.keep(KeptMeasurement("m", uuids=(THREE, TWO)))
+    assert [names.has_node(uuid) for uuid in (ONE, TWO, THREE)] == [True] * 3
+    names.forget("m")
+    assert not names.has_node(TWO)
+    names.rename(TWO, 1, "force")
+    names.set_frame(THREE, 0, "tool")
+    assert [names.has_node(uuid) for uuid in (TWO, THREE, bytes(9) + b"x")] == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("also", "message"),
+    [
+        ((), "Group 'hand' has 2 kept measurements (m1, m2), which would be deleted with it."),
+        (("m1",), "Group 'hand' has 2 kept measurements (m1, m2), which would be deleted with it."),
+        (("m3", "m2", "m1"), None),
+    ],
+)
+def test_a_group_goes_only_with_the_measurements_that_may_go_with_it(
+    station: Station, also: tuple[str, ...], message: str | None
+) -> None:
+    for group in ("hand", "arm"):
+        station.groups.put(Group(group, (ONE,)))
+    for id, group in (("m1", "hand"), ("m2", "hand"), ("m3", "arm")):
+        station.measurements.keep(KeptMeasurement(id, group=group))
+    if message is None:
+        assert station.measurements.delete_group("hand", also=also) == (True, ("m1", "m2"))
+        assert [one.id for one in station.measurements.all()] == ["m3"]
+        assert station.measurements.delete_group("hand") == (False, ())
+        return
+    with pytest.raises(FrozenError) as refused:
+        station.measurements.delete_group("hand", also=also)
+    assert refused.value.message == message
+    assert [one.id for one in station.measurements.all()] == ["m1", "m2", "m3"]
+    assert station.groups.find("hand") is not None
