@@ -73,6 +73,7 @@ class PcscReader:
 def _chosen(wanted: str) -> str:
     found = names() if wanted else contactless(names())
     fitting = [wanted] if wanted in found else [name for name in found if wanted.lower() in name.lower()]
+    fitting = contactless(fitting) or fitting  # the slot beside an antenna is meant only by its own name
     if len(fitting) == 1:
         return fitting[0]
     listed = ", ".join(fitting or found)

@@ -169,6 +169,27 @@ def test_the_slot_of_a_security_module_is_no_reader_for_nodes(monkeypatch: pytes
     assert open_reader("pcsc").name == "ACS ACR1252 PICC Reader 00"
 
 
+@pytest.mark.parametrize(
+    ("path", "taken"),
+    [
+        ("pcsc:ACR1252", "ACS ACR1252 PICC Reader 00"),
+        ("pcsc:acs acr1252", "ACS ACR1252 PICC Reader 00"),
+        ("pcsc:SAM", "ACS ACR1252 SAM Reader 01"),
+        ("pcsc:ACS ACR1252 SAM Reader 01", "ACS ACR1252 SAM Reader 01"),
+        ("pcsc:Omni", "HID Omnikey 5022 00"),
+        ("pcsc:HID Omnikey 5022 00", "HID Omnikey 5022 00"),
+    ],
+)
+def test_a_reader_is_named_by_a_part_of_its_name_and_its_slot_for_security_modules_is_passed_by(
+    monkeypatch: pytest.MonkeyPatch, path: str, taken: str
+) -> None:
+    """``pcsc:ACR1252`` fitted both slots of one reader, and was refused. A whole name means that reader alone."""
+    names = ["ACS ACR1252 SAM Reader 01", "ACS ACR1252 PICC Reader 00", "HID Omnikey 5022 00", "HID Omnikey 5022 00 01"]
+    put_in(monkeypatch, names if "Omni" not in path or path.endswith("00") else names[:3])
+    found = open_reader(path)
+    assert (found.name, found.again) == (taken, f"pcsc:{taken}")
+
+
 def test_without_the_client_library_its_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pcsclite, "LIBRARY", "libpcsclite.so.none")
     pcsclite.load.cache_clear()
