@@ -2305,6 +2305,13 @@ PATTERNS = (
         "tests/station/test_pins.py",
     ),
     Pattern(
+        "a report names no station, a removed one neither",
+        "_names_of_stations",
+        "roster.by_key.values()",
+        "roster.members",
+        "tests/doctor/test_report.py",
+    ),
+    Pattern(
         "a node keeps its own frames",
         "Measurements._hand_on_names",
         "new is not None and (new, channel) not in frames",
