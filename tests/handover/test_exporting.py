@@ -219,6 +219,7 @@ def test_a_plan_changes_nothing(pair: Pair) -> None:
 
 def test_the_bundle_says_what_the_profile_lists(pair: Pair) -> None:
     provisioned(pair.north, pair.board)
+    before = datetime.now(UTC).replace(microsecond=0)
     path, _exported = pair.export("copy")
     keys = {pair.north.fingerprint: pair.north.point}
     opened = open_bundle(path.read_bytes(), pair.south.vault.identity(), keys.get, datetime.now(UTC))
@@ -227,7 +228,8 @@ def test_the_bundle_says_what_the_profile_lists(pair: Pair) -> None:
     assert record is not None
     assert (node.uuid, node.node_key, node.key) == (pair.board.uuid, pair.board.key.point, pair.board.state.key)
     assert (node.epoch, node.sequence, node.teds_sha256) == (1, 1, record.teds_sha256)
-    assert opened.bundle.expires - opened.bundle.created == timedelta(days=7)
+    begun = opened.bundle.expires - timedelta(days=7)  # of the plan; it is sealed, and so created, a moment later
+    assert before <= begun <= opened.bundle.created <= datetime.now(UTC)
     assert opened.station_signature is not None
     assert json.loads(path.read_bytes())["recipients"][0]["header"]["kid"] == pair.south.fingerprint
 
