@@ -1215,6 +1215,20 @@ PATTERNS = (
         "tests/measure/sinks/test_live.py",
     ),
     Pattern(
+        "relative humidity is a plain number or a ratio",
+        "meaning_of",
+        "facts.units in _RATIOS",
+        "facts.units is not None",
+        "tests/measure/sinks/test_live.py",
+    ),
+    Pattern(
+        "a part of a reader's name means no slot for security modules",
+        "_chosen",
+        "contactless(fitting) or fitting",
+        "fitting",
+        "tests/links/nfc/test_nfc_pcsc.py",
+    ),
+    Pattern(
         "metadata has the frame filled in",
         "TopicSink._metadata",
         "self._frame(facts)",
