@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from teds_provision.cli import main, stdout
 from teds_provision.cli.context import App
+from teds_provision.cli.stdout import CleanText
 from teds_provision.sanitize import printable, sanitize, sanitize_json
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
@@ -109,6 +111,25 @@ def test_a_long_list_into_head(home: Path, run: str) -> None:
 # -- text from outside -------------------------------------------------------------------------------------------------
 
 STEERING = "\x1b[31mred\x9b2J\u202etxt\x07"
+
+
+STEERS = [*range(0x09), 0x0B, 0x0C, *range(0x0E, 0x1B), *range(0x1C, 0x20), *range(0x7F, 0xA0), *range(0x200B, 0x2010)]
+STEERS += [*range(0x202A, 0x202F), *range(0x2060, 0x2065), *range(0x2066, 0x2070), 0xFEFF, 0xD800, 0xDFFF]
+
+
+def test_each_character_that_steers_a_terminal_or_the_direction_of_text_leaves_as_an_escape() -> None:
+    """Control characters (C0, C1), zero-width characters, marks of direction, isolates, halves of surrogate pairs."""
+
+    def written(text: str) -> str:
+        octets = io.BytesIO()
+        out = CleanText(octets, encoding="utf-8", write_through=True)
+        assert out.write(text) == len(text)
+        return octets.getvalue().decode()
+
+    for code in STEERS:
+        assert written(f"a{chr(code)}b") == f"a\\u{code:04x}b"
+    for code in (0x09, 0x0A, 0x1B, 0x20, 0x7E, 0xA0, 0xB0, 0xE4, 0x200A, 0x2010, 0x2026, 0x2212, 0xFFFD, 0x1F600):
+        assert written(f"a{chr(code)}b") == f"a{chr(code)}b", hex(code)
 
 
 def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:

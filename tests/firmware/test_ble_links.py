@@ -144,3 +144,20 @@ def test_questions_are_answered_anew_each_time_by_what_is_so_now(air: Air) -> No
     assert air.write(0, prove).ok
     air.node.chip_fails(1)
     assert air.write(0, prove, again=True) == refusal(Reason.FLASH_FAILURE), "its chip was asked again"
+
+
+@pytest.mark.parametrize(
+    "second",
+    ["0008 0040 0014", "0007 0041 0014", "0007 0030 0014", "0007 0040 0013", "0007 0040 0015", "0007 0040 0014", None],
+    ids=["transaction", "longer", "shorter", "earlier offset", "later offset", "nothing wrong", "empty"],
+)
+def test_a_frame_that_does_not_continue_the_message_drops_it(air: Air, second: str | None) -> None:
+    """A message of 64 octets in two frames of 20 and 44; without a fault it is answered with refusal 1."""
+    message = bytes.fromhex("0000 ff 01 003a") + bytes(58)
+    head = bytes.fromhex("0007 0040")
+    air.node.ble_written(0, head + b"\0\0" + message[:20])
+    rest = message[20:48] if second == "0007 0030 0014" else message[20:] if second else b""  # as long as it says
+    replies = air.node.ble_written(0, bytes.fromhex(second or "0007 0040 0014") + rest)
+    assert bool(replies) is (second == "0007 0040 0014")
+    if not replies:  # and it stays dropped: the right rest comes too late
+        assert not air.node.ble_written(0, head + b"\0\x14" + message[20:])

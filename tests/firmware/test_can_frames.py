@@ -175,6 +175,21 @@ def test_a_station_that_waits_for_the_answer_to_everyone_keeps_its_line_if_anoth
     assert bus.says(station=0xF3)[0][0].startswith("001b42")
 
 
+@pytest.mark.parametrize(("step", "answered"), [(0.6, True), (0.7, False)])
+def test_a_request_has_five_seconds_from_its_first_frame_however_fast_its_frames_follow(
+    bus: Bus, step: float, answered: bool
+) -> None:
+    """Eight frames behind the first, each within N_Cr; the last one 4.8 or 5.6 s after it."""
+    head, rest = first_frame(bytes.fromhex("07 0000 ff 01 0038") + bytes(56), fd=False)
+    bus.hears(head.hex())
+    assert bus.says()[0][0].startswith("30")
+    frames = list(consecutive_frames(rest, fd=False))
+    for frame in frames:
+        bus.now += step * 8 / len(frames)
+        bus.hears(frame.hex())
+    assert bool(bus.says()) is answered
+
+
 def test_a_first_frame_that_is_followed_by_number_0_is_torn(bus: Bus) -> None:
     head, rest = first_frame(bytes.fromhex("07 0001 0102 0005 0c 00000000"), fd=False)
     bus.hears(head.hex())

@@ -301,6 +301,14 @@ def test_a_selection_that_does_not_add_up(taps: Callable[[int, int], Taps], sele
     reader.write(message.encode([piece]))
 
 
+@pytest.mark.parametrize("behind", [b"\0", b"\x10\0\0", bytes(9)], ids=bytes.hex)
+def test_octets_behind_the_last_record_make_a_message_garbled(taps: Callable[[int, int], Taps], behind: bytes) -> None:
+    reader, select = taps(4, 499), message.encode([tnep.select(tnep.SERVICE)])
+    wrong = reader.write(select + behind)
+    assert wrong != bytes.fromhex("d10201546500")
+    assert reader.write(select) == bytes.fromhex("d10201546500")
+
+
 def payload(head: str, body: bytes) -> bytes:
     """Return a payload record with a right CRC: version, flags, transaction, total, offset, and the body."""
     octets = bytes.fromhex(head)

@@ -15,6 +15,7 @@ import pytest
 
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.station.station import Station
+from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
 from tests.cli.shell import PROGRAM
 from tests.e2e.desk import ANGLE
@@ -45,6 +46,27 @@ def test_nodes_are_listed_by_name_those_that_are_there_first(prepared: Path, tmp
         listed.refresh()
         listed.note("e5" * 10, "came", present=True)
         assert [node["name"] or None for node in listed.nodes()] == ["zebra", "Arm 1", "arm 2", "arm 10", None]
+
+
+def test_a_datasheet_that_was_read_just_now_is_in_the_next_answer_and_so_is_its_end(
+    prepared: Path, tmp_path: Path
+) -> None:
+    """Parts of the answer are cached until something changes."""
+    shutil.copytree(prepared / "bench", tmp_path / "bench")
+    silence: Any = NoListeners()
+    sheet = Sheet.from_blocks(load_profile("accelerometer").build(bytes(10)).blocks)
+    with Station.inspect(tmp_path / "bench") as station:
+        listed, uuid = NodeDirectory(station, silence), "a" * 20
+        listed.note(uuid, "came", present=True, looked=1.0)
+
+        def channels() -> int:
+            return len(json.loads(listed.nodes_text())["nodes"][0]["channels"])
+
+        assert channels() == 0
+        listed.show_sheet(uuid, sheet)
+        assert channels() == 3
+        listed.show_sheet(uuid, None)
+        assert channels() == 0
 
 
 def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest(prepared: Path, tmp_path: Path) -> None:

@@ -44,6 +44,13 @@ def roster(version: int = 1, members: tuple[Member, ...] = MEMBERS, gone: tuple[
     return Roster(REGISTRY, "plant", version, previous, NOW, until, members, gone, hash=hash or f"{version:064x}")
 
 
+def test_roles_of_members_and_of_removed_ones_are_signed_in_the_order_of_the_contract() -> None:
+    every = "audit base sign line keeper"
+    said = roster(members=(member("north", every),), gone=(removed("lost", every),)).unsigned()
+    for listed in ("members", "removed"):
+        assert said[listed][0]["roles"] == ["keeper", "line", "sign", "base", "audit"]
+
+
 # -- who is who --------------------------------------------------------------------------------------------------------
 
 

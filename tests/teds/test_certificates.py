@@ -166,6 +166,20 @@ def test_two_indications_of_one_table_are_two_items(angle: Profile) -> None:
     assert read_certified(both, "c.xml", angle, CertificateChoice(item="channel-1.2"))[1].points[0][0] == 401
 
 
+def test_an_item_may_be_named_by_its_table_if_one_result_of_it_fits(angle: Profile) -> None:
+    text = ANGLE.decode()
+    start = text.index('<dcc:quantity refType="basic_measuredValue')
+    end = text.index("</dcc:quantity>", start) + len("</dcc:quantity>")
+    second = text[start:end].replace("400 16700", "401 16701").replace("Raw value", "Raw value at 30 K more")
+    both = (text[:end] + second + text[end:]).encode()
+    assert [item.id for item in items_of(read(both))] == ["channel-1.1", "channel-1.2"]
+    for named in ("channel-1", "channel-1.1"):
+        choice = CertificateChoice(item=named, choose=lambda _question, items: items[0][0])
+        assert read_certified(both, "c.xml", angle, choice)[1].points[0][0] == 400
+    with pytest.raises(UnclearItemError):
+        read_certified(both, "c.xml", angle, CertificateChoice(item="channel-1"))
+
+
 def test_a_channel_must_be_named_if_the_type_has_several() -> None:
     hand = load_profile("tactile-finger-sensor")
     with pytest.raises(BadDataError, match=r"say which one c\.xml is for") as caught:

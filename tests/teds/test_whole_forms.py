@@ -11,7 +11,7 @@ import pytest
 from teds_provision import teds
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import frame, unframe
-from teds_provision.teds.codec.model import TimeInstance, Units
+from teds_provision.teds.codec.model import Edition, TimeInstance, Units
 from teds_provision.teds.formats import TedsBlock, read_blocks
 from teds_provision.teds.formats.intelhex import stretches, write_hex, write_intel_hex
 from teds_provision.teds.formats.jsonform import read_json, write_json
@@ -269,6 +269,21 @@ def test_json_whole() -> None:
 def test_xml_whole() -> None:
     assert write_xml(BLOCKS) == XML
     assert read_xml(XML.encode()) == BLOCKS
+
+
+@pytest.mark.parametrize(
+    ("edition", "time"),
+    [
+        (2007, TimeInstance((1 << 32) - 1, (1 << 31) - 1)),
+        (2007, TimeInstance((1 << 32) - 1, 0, True)),
+        (2024, TimeInstance(1 << 32, (1 << 32) - 1)),
+        (2024, TimeInstance((1 << 48) - 1, 0)),
+    ],
+)
+def test_the_longest_times_of_both_editions_go_through_json_and_xml(edition: Edition, time: TimeInstance) -> None:
+    block = TedsBlock(1, 5, teds.compose(5, {"LstCalDt": time}, edition=edition))
+    assert read_json(write_json([block])) == [block]
+    assert read_xml(write_xml([block]).encode()) == [block]
 
 
 def test_hex_whole() -> None:
