@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.cli.station.handover import import_text
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import (
@@ -242,3 +243,17 @@ def test_all_again_means_the_newest_open_move_with_all_that_its_command_made() -
     assert _of_the_last_run([notes("old"), notes("new")]) == [notes("new")]
     old, new = notes("old", "run 1"), [notes(name, "run 2") for name in ("one", "two")]
     assert _of_the_last_run([old, *new]) == new
+
+
+def test_every_note_about_every_accepted_node_is_in_the_plan_of_an_import(pair: Pair) -> None:
+    provisioned(pair.north, pair.board)
+    path, _exported = pair.export("copy")
+    plan = plan_import(pair.south, path.read_bytes())
+    assert isinstance(plan, ImportPlan)
+    (node,) = plan.nodes
+    noted = replace(plan, nodes=(replace(node, notes=("Its name is taken.", "Its group is measured.")),) * 2)
+    uuid = pair.board.uuid.hex()
+    lines = import_text(pair.south, noted).splitlines()
+    assert [line for line in lines if line.startswith(f"  {uuid}: ")] == [
+        f"  {uuid}: Its name is taken.", f"  {uuid}: Its group is measured.",
+    ] * 2  # fmt: skip
