@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -106,7 +107,8 @@ def strangers_reading(
     def from_image(image: Image) -> None:
         shown.update(image.blocks)
 
-    monkeypatch.setattr(inspection, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    clock = itertools.count(1000.0, 7.0)  # each look at the clock is seven seconds later
+    monkeypatch.setattr(inspection, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     monkeypatch.setattr(inspection, "list_blocks", lambda _node: listed)
     monkeypatch.setattr(inspection, "read_block", read_block)
     monkeypatch.setattr(inspection, "is_keyed", lambda *_words: False)

@@ -366,6 +366,8 @@ def test_a_member_reads_all_pages_and_a_reader_all_but_parcels(thief: Connection
     query = "set role teds_reader; select count(*) > 0 from registry.page; select count(*) from registry.parcel"
     with pytest.raises(Exception, match="permission denied for table parcel"):
         rig.database.sql(query)
+    for table in ("page", "member", "roster", "meta", "found", "handed"):
+        assert rig.database.sql(f"set role teds_reader; select count(*) >= 0 from registry.{table}")[-1] == ["t"], table
 
 
 def test_each_member_has_its_roster_row_and_a_rolled_back_one_is_put_back(rig: Rig) -> None:

@@ -108,6 +108,26 @@ def test_an_identified_node_may_be_written_over_the_other_link(station: Station,
     assert board.state.sequence == 2
 
 
+@pytest.mark.parametrize("lost", [True, False], ids=["a TEDS is gone", "a TEDS is another one"])
+def test_a_board_whose_teds_are_not_those_of_its_signature_gets_a_newer_sequence(
+    station: Station, board: Board, lost: bool
+) -> None:
+    """Its Security TEDS is the signed one still; it takes the same content only under a newer sequence."""
+    first = run(station, board)
+    blocks = dict(board.state.blocks)
+    place = next(place for place in blocks if place[1] == 3)
+    if lost:
+        del blocks[place]
+    else:
+        blocks[place] = blocks[place][:-2] + b"xx"
+    board.flash.state = replace(board.state, blocks=blocks)
+    board.power_on()
+    again = run(station, board, order=BuildOrder(profile="magnetic-angular-position-sensor"))
+    assert again.verified.verdict == "authentic"
+    assert again.image.unsigned_blocks() == first.image.unsigned_blocks()
+    assert board.state.sequence == 2
+
+
 def exchanges_of_a_whole_run(tmp_path: Path) -> int:
     link = MemoryLink(Board())
     run(copied_station(tmp_path / "count"), link.board, link)

@@ -29,7 +29,7 @@ from teds_provision.measure.blocks import (
     StationFacts,
     why_invalid,
 )
-from teds_provision.measure.sinks import names
+from teds_provision.measure.sinks import live, names
 from teds_provision.measure.sinks.base import LIVE_WAITING, ROWS
 from teds_provision.measure.sinks.joints import joints_of, state_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
@@ -341,6 +341,27 @@ def test_scalars_go_out_at_their_rate_with_the_newest_value() -> None:
     sink = carried([block([[k], [k + 1]]) for k in range(50)], station=replace(STATION, scalar_rate=0.5))
     assert sink.scalars == [("/bench/arm/angle", "std_msgs/Float64", pytest.approx(0.1), pytest.approx(0.0087**2 / 3))]
     assert carried([block()], station=replace(STATION, scalar_rate=0)).scalars == []
+
+
+@pytest.mark.parametrize(("rate", "messages"), [(10.0, 30), (20.0, 60), (1e6, 101)])
+def test_the_rate_of_scalars_is_kept_on_average_whatever_the_beat_of_the_blocks(
+    monkeypatch: pytest.MonkeyPatch, rate: float, messages: int
+) -> None:
+    """A block each 30 ms for 3 s: counted from the last message, 10 Hz became 8.3 Hz, as each waits for a block."""
+    now = [100.0]
+    monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    sink = Carrier()
+    sink.open([ANGLE], replace(STATION, scalar_rate=rate))
+    for number in range(101):
+        now[0] = 100.0 + 0.03 * number
+        sink._block(block([[number]], channels=(1,)))
+    assert len(sink.scalars) == pytest.approx(messages, abs=1)
+    now[0] += 60  # a long silence is not made up for
+    before = len(sink.scalars)
+    for number in range(5):
+        now[0] += 0.0001
+        sink._block(block([[number]], channels=(1,)))
+    assert len(sink.scalars) - before == (5 if rate > 1e5 else 1)
 
 
 def test_an_invalid_value_has_no_scalar_message_and_is_nan_in_the_array() -> None:
