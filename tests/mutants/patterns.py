@@ -4556,8 +4556,8 @@ SCRIPT_PATTERNS = (
     ScriptPattern(
         "a slider stays within the limits",
         "format.js",
-        "rounded < (low ?? -Infinity) ? low : rounded > (high ?? Infinity) ? high : rounded",
-        "rounded",
+        "return rounded > most + ROUNDING * Math.abs(most) ? high : rounded",
+        "return rounded",
         "tests/page/test_modules.py",
     ),
     ScriptPattern(

@@ -60,6 +60,9 @@ def test_a_number_has_the_digits_that_its_uncertainty_allows(stage: Stage) -> No
             ([-1e-7, -1e-7, NONE], -1e-7),
             ([5, 5, NONE], 5),
             ([-5, NONE, NONE], -5),
+            ([109.99999940395355, 0, 109.99999940395355], 110),  # 0.11 m with 32 bits, in mm
+            ([-109.99999940395355, -109.99999940395355, 0], -110),
+            ([109.9999, 0, 109.9999], 109.9999),
         ],
     )
 

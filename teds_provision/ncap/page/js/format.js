@@ -1,5 +1,7 @@
 // Formats numbers, times and names.
 
+const ROUNDING = 1e-7; // of an end of a range: half a step of 32 bits is at most 6e-8 of it; the station allows 5e-7
+
 /** Digits after the point so that the uncertainty has two figures; without one, five figures in all. */
 function places(value, uncertainty) {
   if (uncertainty > 0) return Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(uncertainty) + 1e-6)));
@@ -52,10 +54,13 @@ export function short(value) {
   return sign(String(Number(value.toPrecision(4))));
 }
 
-/** Four figures of a number, but never beyond the ends of its range: the station would refuse it. */
+/** Four figures of a number, but never beyond the ends of its range, which the station would refuse. It takes what an
+ * end lost to its 32 bits (110 for 109.9999994). */
 export function within(value, low, high) {
   const rounded = Number(value.toPrecision(4));
-  return rounded < (low ?? -Infinity) ? low : rounded > (high ?? Infinity) ? high : rounded;
+  const least = low ?? -Infinity, most = high ?? Infinity;
+  if (rounded < least - ROUNDING * Math.abs(least)) return low;
+  return rounded > most + ROUNDING * Math.abs(most) ? high : rounded;
 }
 
 const sign = (words) => words.replaceAll("-", "\u2212");
