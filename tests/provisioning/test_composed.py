@@ -299,6 +299,16 @@ def test_what_was_built_and_never_written_is_no_part_of_what_stays_without_a_yes
     assert warning.startswith(f"Node {UUID.hex()} has a draft (built as load-cell) that was never written; it is kept")
 
 
+def test_a_draft_of_what_is_written_now_gives_no_warning_and_one_of_other_content_does(station: Station) -> None:
+    has = Image(UUID, {(0, 1): b"a", SECURITY: b"s"})
+    station.datasheets.keep_draft(Draft(UUID, Image(UUID, {(0, 1): b"b"}), "built", "load-cell"))
+    for wanted, warned in ((b"b", False), (b"c", True), (b"a", True)):
+        found = step.unwritten_draft(station, has, Image(UUID, {(0, 1): wanted}))
+        assert bool(found) is warned, wanted
+    station.datasheets.drop_draft(UUID)
+    assert step.unwritten_draft(station, has, Image(UUID, {(0, 1): b"c"})) == ()
+
+
 def test_of_a_datasheet_that_stays_those_teds_alone_change_that_are_named(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
