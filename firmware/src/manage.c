@@ -355,7 +355,7 @@ static void continue_upload(teds_node *node, teds_session *session, const packet
     if (answer->refuses) {
         return;
     }
-    /* An image whose length nobody gave is never whole; of one that has more octets than its length nothing can follow. */
+    /* Without `len` an upload is never complete by `off`. With it, `off` at or beyond `len` ends the upload. */
     own->upload_of = answer->complete || (answer->off_there && own->upload_octets != 0 && answer->off >= own->upload_octets)
                          ? NULL
                          : session;

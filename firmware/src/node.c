@@ -115,7 +115,7 @@ uint64_t teds_node_missed(const teds_node *node)
 #if TEDS_OPERATION
     uint64_t missed = node->missed;
     for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
-        missed += each->missed; /* 0 where none runs */
+        missed += each->missed; /* 0 if no stream runs in this place */
     }
     return missed;
 #else

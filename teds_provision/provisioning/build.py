@@ -701,7 +701,7 @@ def pending_image(station: Station, uuid: bytes, has: Image | None) -> Image | N
 def unwritten_draft(station: Station, has: Image | None, wanted: Image) -> tuple[str, ...]:
     """Return a warning if the node has a draft that was never written and has other content than ``wanted``.
 
-    ``has`` is what the node has now. Who writes ``wanted`` leaves that draft where it is.
+    ``has`` is the datasheet on the node now. The caller writes ``wanted`` and keeps that draft.
     """
     pending, draft = pending_image(station, wanted.uuid, has), station.datasheets.draft(wanted.uuid)
     if pending is None or draft is None or pending.unsigned_blocks() == wanted.unsigned_blocks():
