@@ -118,7 +118,7 @@ class _Reader:
                 plan = incoming.plan_import(self.station, octets, self.now)
             except TedsProvisionError as error:
                 if isinstance(error, incoming.NothingImportedError):
-                    self._refuse(error)
+                    refuse_bundle(self.station, error)
                 self.station.plant.parcels.drop(row.id, "in")
                 return True
             why = "" if isinstance(plan, incoming.ImportResult) else self._why_not(plan)
@@ -148,7 +148,7 @@ class _Reader:
             try:
                 plan = incoming.plan_import(self.station, parcel.octets, self.now)
             except incoming.NothingImportedError as error:
-                self._refuse(error)
+                refuse_bundle(self.station, error)
                 return True
             row = self._row(parcel, "bundle")
             if isinstance(plan, incoming.ImportResult):
@@ -248,14 +248,6 @@ class _Reader:
             parcels.put(row, parcel.octets)
         return False
 
-    def _refuse(self, error: incoming.NothingImportedError) -> None:
-        """Record on the next page that a bundle was refused whole: it is never sent again for these keys."""
-        with self.station.transaction():
-            for planned in error.nodes:
-                facts = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": planned.why}
-                self.station.plant.record_event("refused", planned.node.uuid, **facts)
-            self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
-
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
         """Discard a parcel that is of no use, which would stay there until it expires; an alarm if it is suspicious.
 
@@ -313,6 +305,20 @@ def import_parcel(
         station.plant.parcels.drop(row.id, "in")
         _put_out(station, "receipt", done.row.peers[0], done.receipt.strip(), done.row.id)
     return done
+
+
+def refuse_bundle(station: Station, error: incoming.NothingImportedError, parcel: str = "") -> None:
+    """Record on the next page that a bundle was refused whole: it is never sent again for these keys.
+
+    ``parcel`` is the waiting parcel that held it, which is then dropped. The caller holds the lock.
+    """
+    with station.transaction():
+        for planned in error.nodes:
+            facts = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": planned.why}
+            station.plant.record_event("refused", planned.node.uuid, **facts)
+        if parcel:
+            station.plant.parcels.drop(parcel, "in")
+        station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
 
 
 def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]]:

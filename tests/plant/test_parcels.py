@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -527,21 +528,25 @@ def test_parcels_that_are_refused_are_named_with_the_exit_code_of_the_refusal(pl
             parcels.send_export(west, outgoing.plan_export(west, order), now())
     sync(plant, "west", "south")
     first, second = (row.id for row in south.plant.parcels.all("in", "waiting"))
+    abouts = {row.id: row.about for row in south.plant.parcels.all("in", "waiting")}
     uuids = {row.id: pending_uuid(south, row.id) for row in south.plant.parcels.all("in", "waiting")}
     life.revoke(south, uuids[first], "stolen")
     words = ("import-keys", "--received", "--yes")
     shown = call(tmp_path / "south", "--json", *words, "--dry-run")
     assert (shown.code, [one["parcel"] for one in shown.json["received"]]) == (6, [second])
+    assert (shown.json["error"]["code"], [one["parcel"] for one in shown.json["refused"]]) == ("refused", [first])
+    assert shown.json["refused"][0]["why"] == shown.json["error"]["message"]
     done = call(tmp_path / "south", *words)
     assert (done.code, done.out) == (6, "1 parcel imported; the receipts leave with the next sync. 1 parcel refused.\n")
     assert f"Warning: Parcel {first} is refused: None of the nodes in the bundle can be imported" in done.err
-    assert done.err.endswith("The parcel stays here until it expires. Notify the sender.\n")
+    hint = "The next sync reports this to the sender, which does not send these keys again.\n"
+    assert done.err.endswith(hint)
     again = call(tmp_path / "south", *words)
-    assert (again.code, again.out) == (6, "0 parcels imported. 1 parcel refused.\n")
-    told = call(tmp_path / "south", "--json", *words)
-    assert (told.code, told.json["received"], told.json["error"]["code"]) == (6, [], "refused")
-    assert [one["parcel"] for one in told.json["refused"]] == [first]
-    assert told.json["refused"][0]["why"] == told.json["error"]["message"]
+    assert (again.code, again.out) == (0, "Nothing waits.\n")
+    events = [json.loads(text) for _, _, text in south.plant.outbox(100)]
+    [refusal] = [one for one in events if one["act"] == "refused"]
+    assert (refusal["uuid"], refusal["bundle"]) == (uuids[first].hex(), abouts[first])
+    assert refusal["peer"] == west.fingerprint
 
 
 def pending_uuid(station: Station, parcel: str) -> bytes:

@@ -82,6 +82,15 @@ def extend_import(command: click.Command) -> None:
     command.callback = import_keys
 
 
+def _refuse(app: App, station: Station, parcel: str, octets: bytes) -> None:
+    """Answer a bundle of which nothing can be imported, unless that has changed meanwhile."""
+    with station.lock("import-keys", app.note):
+        try:
+            plan_import(station, octets)
+        except NothingImportedError as error:
+            plant.parcels.refuse_bundle(station, error, parcel)
+
+
 def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
     """Show each waiting parcel with its reason; take in those that the user confirms.
 
@@ -99,7 +108,9 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
         except TedsProvisionError as error:
             app.warn(f"Parcel {row.id} is refused: {error.message}")
             if isinstance(error, NothingImportedError):  # others may be imported all the same
-                error.hint = "The parcel stays here until it expires. Notify the sender."
+                error.hint = "The next sync reports this to the sender, which does not send these keys again."
+                if not dry_run:
+                    _refuse(app, station, row.id, octets)
             refused[row.id] = error
             continue
         app.note(f"{import_text(station, shown)}\nReason for waiting: {row.detail or 'it has just arrived'}")
