@@ -309,12 +309,17 @@ def _obeyed(stranger: _Stranger, right: bool, text: str) -> None:
         raise RuleBrokenError(text)
 
 
+def _require_lesser(own: int) -> None:
+    """Raise NotApplicableError if this CRC-32 is the greatest: the node would take the claim for its own Announce."""
+    if own == _GREATEST:
+        raise NotApplicableError("The CRC-32 of this UUID is the greatest: no other claim loses against it.")
+
+
 @rule("can-announce", "CAN", Stage.PLAIN)
 def can_announce(probe: Probe) -> str:
     """Check that the node keeps its address after an Announce with a greater CRC, and repeats its own Announce."""
     own, state = uuid_crc(probe.uuid), probe.identity().state
-    if own == _GREATEST:
-        raise NotApplicableError("The CRC-32 of this UUID is the greatest: no other claim loses against it.")
+    _require_lesser(own)
     link = probe.framed
     assert probe.contact.address is not None
     home = probe.contact.address
@@ -343,7 +348,8 @@ def can_pressed(probe: Probe) -> str:
     """Check that an Announce of a pressed button claims nothing: the node neither moves nor announces."""
     link, own, home = probe.framed, uuid_crc(probe.uuid), probe.contact.address
     assert home is not None
-    if own == _GREATEST or probe.plain(ABOUT).reason == Reason.UNKNOWN_COMMAND:
+    _require_lesser(own)
+    if probe.plain(ABOUT).reason == Reason.UNKNOWN_COMMAND:
         raise NotApplicableError("The node is from before pressed buttons were announced (128.21 gets 1).")
     with link.single_frames() as frames:
         frames.send(ANNOUNCE | home, Announce(home, NodeState.FACTORY, _GREATEST, pressed=True).encode())
