@@ -40,9 +40,21 @@ class Outcome:
         return json.loads(self.out)
 
 
-def call(home: Path, *words: object, passphrase: str | None = PASSPHRASE) -> Outcome:
-    """Run a command in this process; stdin is no terminal, the passphrase comes through --passphrase-fd."""
-    out, err = io.StringIO(), io.StringIO()
+class Screen(io.StringIO):
+    """A terminal that keeps what is written to it."""
+
+    def isatty(self) -> bool:
+        """Return True."""
+        return True
+
+
+def call(home: Path, *words: object, passphrase: str | None = PASSPHRASE, terminal: bool = False) -> Outcome:
+    """Run a command in this process; stdin is no terminal, the passphrase comes through --passphrase-fd.
+
+    With ``terminal``, stdout and stderr are one.
+    """
+    kind = Screen if terminal else io.StringIO
+    out, err = kind(), kind()
     before = sys.stdin
     sys.stdin = io.StringIO("")
     read, write = os.pipe()

@@ -11,12 +11,13 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import click
 import pytest
 
 from teds_provision.cli import shell_completion
+from teds_provision.errors import StoreError
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 
 from .shell import call, clean_environment
@@ -167,3 +168,17 @@ def test_nodes_are_offered_by_name_and_uuid_and_stations_by_name(home: Path, tmp
     assert offers(click.Option(["--name"]), "fin") == []
     assert offers(click.Option(["--profile"]), "load-c") == ["load-cell"]
     assert offers(click.Option(["--extends"]), "load-c") == ["load-cell"]
+
+
+def test_without_a_store_or_with_a_broken_one_nothing_is_offered(home: Path, tmp_path: Path) -> None:
+    def broken(_station: Any) -> Any:
+        raise StoreError("The disk is away.")
+
+    there, nowhere = (
+        cast(Any, SimpleNamespace(find_root=lambda folder=folder: SimpleNamespace(params={"home": folder})))
+        for folder in (home, tmp_path / "none")
+    )
+    assert shell_completion._items(nowhere, lambda _station: [("a", "b")]) == []
+    assert shell_completion._items(there, broken) == []
+    found = shell_completion._items(there, lambda _station: [("a", "b\nc"), ("two\nlines", "x")])
+    assert [item.value for item in found] == ["a"], "no word of two lines"

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import pytest
+
+from teds_provision.cli.station import doctor
+from teds_provision.doctor.checks import Finding
 
 from .shell import call, clean_environment, spawn
 
@@ -96,3 +101,51 @@ def test_values_that_no_command_takes_and_profiles_that_cannot_be_read_are_repor
     (home / "profiles" / "mine.toml").write_text('extends = "load-cell"\ntitle = "mine"\n')
     (home / "config.toml").write_text("[provision]\ntimeout = 3\n")
     assert call(home, "--json", "doctor").json["failed"] == 0
+
+
+FOUND = [
+    ("machine", Finding("python", "ok", "3.11.9", "nothing")),
+    ("machine", Finding("clock", "warning", "It is [b]late[/b].", "Set it.")),
+    ("link", Finding("can0", "failed", "It is down.", "ip link set can0 up")),
+    ("link", Finding("nfc", "skipped", "No reader was named.")),
+]
+
+
+def test_a_terminal_shows_each_finding_in_its_colour_and_the_cure_of_trouble_below(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(doctor, "examine", lambda _system: iter(FOUND))
+    shown = call(home, "doctor", terminal=True)
+    assert shown.code == 5
+    colours = re.findall(r"\x1b\[([0-9;]+)m(ok|warning|failed|skipped) ", shown.out)
+    assert colours == [("32", "ok"), ("33", "warning"), ("1;31", "failed"), ("2", "skipped")]
+    plain = [line.rstrip() for line in re.sub(r"\x1b\[[0-9;]*m", "", shown.out).splitlines()]
+    lines = [
+        "ok       python  3.11.9",
+        "warning  clock   It is [b]late[/b].",
+        "         → Set it.",
+        "failed   can0    It is down.",
+        "         → ip link set can0 up",
+        "skipped  nfc     No reader was named.",
+    ]
+    assert plain == lines
+    assert shown.err == "1 ok, 1 warning, 1 failed, 1 skipped.\n"
+    piped = call(home, "doctor")
+    assert piped.out.splitlines() == [line.replace("         →", "  →") for line in lines]
+
+
+def test_a_report_for_a_program_is_a_member_of_its_one_object(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda _system: iter(FOUND[:2]))
+    monkeypatch.setattr(doctor, "build_report", lambda _system, findings, _settings, **how: {"n": len(findings)} | how)
+    found = call(home, "--json", "doctor", "--report", "-", "--with-uuids").json
+    assert (found["report"], found["ok"], found["warning"], len(found["checks"])) == (
+        {"n": 2, "with_uuids": True},
+        1,
+        1,
+        2,
+    )
+    plain = call(home, "doctor", "--report", "-")
+    assert (json.loads(plain.out), plain.code) == ({"n": 2, "with_uuids": False}, 0)

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
@@ -524,3 +525,51 @@ def test_a_node_that_was_moved_says_where_it_went(homes: Homes) -> None:
     with pytest.raises(Exception, match="was moved"):
         session(station, Pair.make(homes.folder / "more", 1).board)
     station.close()
+
+
+def test_a_bundle_that_was_taken_before_is_shown_as_such(homes: Homes) -> None:
+    bundle = homes.export("--all")
+    assert homes.run(homes.south, "import-keys", bundle, "--yes").code == 0
+    forget_vaults()
+    again = call(homes.south, "import-keys", bundle, "--dry-run")
+    [row] = homes.run(homes.south, "handover", "list").json["handovers"]
+    assert again.out == f"This bundle was imported on {row['created']}; there is nothing to do.\n"
+    plan = homes.run(homes.south, "import-keys", bundle, "--dry-run").json
+    assert ([node["uuid"] for node in plan["same"]] if "same" in plan else plan) != []
+
+
+@pytest.mark.parametrize(
+    ("mode", "fresh", "dry_run", "text"),
+    [
+        ("move", True, False, "imported 2 nodes; their keys are deleted here."),
+        ("move", True, True, "imported 2 nodes; their keys would be deleted here."),
+        ("copy", True, False, "imported 2 nodes."),
+        ("move", False, False, "imported 2 nodes (already known)."),
+        ("copy", False, True, "imported 2 nodes (already known)."),
+    ],
+)
+def test_what_a_receipt_completes_is_said_and_what_was_refused_comes_back(
+    monkeypatch: pytest.MonkeyPatch, mode: str, fresh: bool, dry_run: bool, text: str
+) -> None:
+    monkeypatch.setattr(handover, "peer_name", lambda _station, sender: f"south {sender}")
+    refused: list[Any] = [SimpleNamespace(uuid=bytes.fromhex(UUIDS[0]), why="revoked")]
+    for nodes in ([], refused):
+        receipt = SimpleNamespace(imported=[1, 2], refused=nodes, sender="5e")
+        done: Any = SimpleNamespace(receipt=receipt, row=SimpleNamespace(mode=mode), fresh=fresh)
+        lines = handover._closed_text(cast(Any, None), done, dry_run=dry_run).splitlines()
+        verb = "would belong" if dry_run else "belong"
+        again = f"The refused nodes {verb} to this station again; their keys are rotated at the next contact."
+        assert lines == [
+            f"Station south 5e {text}",
+            *([f"  refused {UUIDS[0]}: revoked"] if nodes else []),
+            *([again] if nodes and mode == "move" else []),
+        ]
+
+
+@pytest.mark.parametrize("words", [[], ["--all", UUIDS[0]]])
+def test_nodes_to_hand_over_are_named_or_all_of_them(homes: Homes, words: list[str]) -> None:
+    done = homes.run(homes.north, "export-keys", "--to", "south", "--yes", "--output", homes.folder / "k", *words)
+    assert (done.code, done.json["error"]["message"]) == (
+        2,
+        "Name the nodes, or use --all. (see: teds-provision export-keys --help)",
+    )

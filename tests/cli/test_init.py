@@ -16,8 +16,10 @@ import pytest
 
 from teds_provision import lazy
 from teds_provision.cli.context import read_line
+from teds_provision.cli.station import init as init_command
 from teds_provision.lazy import how_to_install
-from teds_provision.protocol.keys import fingerprint, from_pem
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem, to_pem
+from tests.bench import copy_home
 
 from .shell import ROOT, call, clean_environment, spawn
 
@@ -264,3 +266,60 @@ def test_a_passphrase_from_a_descriptor_keeps_its_blanks() -> None:
         os.close(far)
         assert read_line(near) == read
         os.close(near)
+
+
+def test_a_plan_with_a_certificate_shows_the_ca_that_it_would_trust(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    point, path = SoftwareKey.generate().point, tmp_path / "lab.cert"
+    monkeypatch.setattr(
+        init_command, "_read_certificate", lambda file: SimpleNamespace(ca=point) if file == path else None
+    )
+    path.touch()
+    home = tmp_path / "home"
+    digits = fingerprint(point)
+    found = call(home, "--json", "init", "--dry-run", "--certificate", path).json
+    assert found == {
+        "plan": True, "name": None, "home": str(home), "ca": {"public_key": to_pem(point), "fingerprint": digits},
+    }  # fmt: skip
+    shown = call(home, "init", "--dry-run", "--certificate", path).out
+    assert shown == f"Plan: trust the CA {digits[:32]}, which issued {path}.\n"
+    words = call(home, "init", "--dry-run", "--keystore", "file", "--ca", path).out
+    what = f"create the station's key, certified by the CA key of {path}"
+    assert words == f"Plan: {what}, in the file keystore (as requested), home {home}.\n"
+    assert not home.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (
+            ["--request", "a", "--certificate", "b"],
+            "Use --request first, then --certificate once the CA has signed it.",
+        ),
+        (["--ca", "a", "--certificate", "b"], "Use --ca alone: the key in its file certifies this station at once."),
+        (["--ca", "a", "--request", "b"], "Use --ca alone: the key in its file certifies this station at once."),
+    ],
+)
+def test_a_station_is_certified_in_one_way(tmp_path: Path, words: list[str], why: str) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).touch()
+    given = [tmp_path / word if len(word) == 1 else word for word in words]
+    refused = call(tmp_path / "home", "--json", "init", *given)
+    assert (refused.code, refused.json["error"]["message"]) == (2, f"{why} (see: teds-provision init --help)")
+    assert not (tmp_path / "home").exists()
+
+
+def test_a_request_that_is_there_is_overwritten_only_if_it_is_this_stations(tmp_path: Path) -> None:
+    home, path = tmp_path / "home", tmp_path / "lab.request"
+    copy_home(home)
+    words = ("--json", "init", "--request", path)
+    path.write_bytes(b"something else")
+    refused = call(home, *words)
+    assert (refused.code, path.read_bytes()) == (2, b"something else")
+    path.unlink()
+    first = call(home, *words)
+    octets = path.read_bytes()
+    assert (first.code, first.json["request"], first.json["ca"]) == (0, str(path), None)
+    assert call(home, *words).json == first.json
+    assert path.read_bytes() == octets

@@ -124,3 +124,26 @@ def test_what_was_handed_on_is_listed() -> None:
         "", "Removed from groups: crane, hand", "Removed from topic names: force", "Removed from measurements: a, b",
         "Measurements that had no other node were deleted: c, d", "Not moved: One stays.", "Not moved: Two stay.",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", [[], ["--lift", "--why", "stolen"]])
+def test_a_ban_is_issued_or_lifted(two: Path, words: list[str]) -> None:
+    done = call(two, "--json", "revoke", OLD, *words)
+    message = "Use --why TEXT to revoke, or --lift alone to lift a ban. (see: teds-provision revoke --help)"
+    assert (done.code, done.json["error"]["message"]) == (2, message)
+
+
+def test_what_a_takeover_drops_is_named_before_the_question_and_what_else_came_up_after_it(
+    two: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert call(two, "build", SPARE, "--profile", "gripper").code == 0
+    dropped, take_over = (
+        f"The draft of node {SPARE} (built as gripper) was never written; it is dropped.",
+        life.take_over,
+    )
+    planned = call(two, "--json", "replace", OLD, SPARE, "--dry-run")
+    assert (planned.err, planned.json["warnings"], planned.json["plan"]) == (f"Warning: {dropped}\n", [dropped], True)
+    monkeypatch.setattr(life, "take_over", lambda *given: ((dropped, "It has no key."), take_over(*given)[1]))
+    done = call(two, "--json", "replace", OLD, SPARE, "--yes")
+    assert (done.code, done.json["warnings"]) == (0, [dropped, "It has no key."])
+    assert done.err == f"Warning: {dropped}\nWarning: It has no key.\n"

@@ -37,6 +37,9 @@ from teds_provision.provisioning.meeting import IdleStop
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.teds.channel import Channel
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.units import parse_unit
 
 from .shell import call
@@ -472,3 +475,30 @@ def test_the_damage_of_a_recording_names_three_pieces() -> None:
         "run.mcap is damaged inside: chunk at octet 100 (70 octets), chunk at octet 200 (70 octets), "
         "chunk at octet 300 (70 octets) and 2 more."
     )
+
+
+def test_a_channel_that_is_named_has_its_number_by_the_datasheet_of_every_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    gripper = load_profile("gripper")
+    images = {uuid: Image(uuid, gripper.build(uuid).blocks) for uuid in (UUID, OTHER)}
+    station: Any = SimpleNamespace(datasheets=SimpleNamespace(datasheet=images.get))
+    numbers = measure_command._numbers
+    assert numbers(station, [UUID, OTHER], [2, "grip force", 7, "opening"]) == [2, 3, 7, 2]
+    assert numbers(station, [], ["opening"]) == []
+    with pytest.raises(BadDataError):
+        numbers(station, [UUID], ["knee"])
+    unknown = bytes(range(20, 30))
+    with pytest.raises(
+        UsageError, match=f"of node {unknown.hex()} are not known yet, so 'opening' cannot be"
+    ) as refused:
+        numbers(station, [UUID, unknown], ["opening"])
+    assert refused.value.hint == f"Give its number, or read the node first: teds-provision verify {unknown.hex()}"
+    of = {UUID: 2, OTHER: 5}
+    monkeypatch.setattr(
+        Sheet,
+        "from_image",
+        lambda image: SimpleNamespace(chosen=lambda _name, _uuid: SimpleNamespace(number=of[image.uuid])),
+    )
+    with pytest.raises(UsageError) as refused:
+        numbers(station, [UUID, OTHER], ["opening"])
+    assert refused.value.message == f"Channel 'opening' has different numbers: 2 on {NODE}, 5 on {OTHER.hex()}."
+    assert refused.value.hint == "Measure them one by one."

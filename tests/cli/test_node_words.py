@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from teds_provision import firmware_image, provisioning
+from teds_provision.cli.context import App
+from teds_provision.cli.node.update import _ProgressTable
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
@@ -21,6 +25,7 @@ from teds_provision.errors import (
     StoreError,
     TedsProvisionError,
 )
+from teds_provision.links.ports import Notice
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.address import AddressReport
 from teds_provision.provisioning.agree import AgreeReport, AgreeResult, ResetReceipt
@@ -30,10 +35,10 @@ from teds_provision.provisioning.meeting import Arrival
 from teds_provision.provisioning.update import BoardUpdate, UpdatePlan
 from teds_provision.station.firmware import FirmwareReading, KnownFirmware
 
-from .shell import call
+from .shell import Screen, call
 from .test_datasheet_words import NFC, Work, both
 
-UUID, OTHER = bytes(range(10)), bytes(range(10, 20))
+UUID, OTHER, THIRD = bytes(range(10)), bytes(range(10, 20)), bytes(range(20, 30))
 NODE = UUID.hex()
 POINT = b"\x04" + bytes(64)
 
@@ -274,13 +279,16 @@ def updating(home: Path, tmp_path: Path, stand_in: Any, monkeypatch: pytest.Monk
         call(home, "whitelist", "add", uuid)
     stand_in(firmware_image, "load_firmware_image", IMAGE)
 
-    def run(plans: dict[bytes, Any], ends: list[BoardUpdate], *words: str, as_json: bool = False) -> Any:
+    def run(plans: dict[bytes, Any], ends: Any, *words: str, as_json: bool = False, terminal: bool = False) -> Any:
         monkeypatch.setattr(
             provisioning.update, "plan_or_refusal", lambda _station, _links, uuid, _order, _reporter: plans[uuid]
         )
         done = stand_in(provisioning.update, "update_boards", ends)
+        if callable(ends):
+            monkeypatch.setattr(provisioning.update, "update_boards", ends)
         uuids = [uuid.hex() for uuid in plans]
-        outcome = call(home, *(["--json"] if as_json else []), "update", *uuids, file, *words, *NFC)
+        given = ["--json"] if as_json else []
+        outcome = call(home, *given, "update", *uuids, file, *words, *NFC, terminal=terminal)
         return outcome, done
 
     return run
@@ -391,13 +399,110 @@ def test_an_update_asks_unless_yes_answers_and_an_image_of_another_board_needs_i
             "hint": "If it is the right one all the same: --other-board",
         },
     )
-    assert done.given[2] == []
+    assert (done.given[2], refused["octets"], refused["seconds"], refused["from"]) == ([], 0, 0.0, "1.3.0+7")
     outcome, done = updating(
         {UUID: plan(question=question)}, [ended("updated")], "--yes", "--other-board", as_json=True
     )
     assert (outcome.code, done.given[2][0][1].other_board) == (0, True)
     outcome, done = updating({UUID: plan(stage="nothing", octets=0)}, [ended("already")], as_json=True)
     assert outcome.code == 0, "nothing to do: nothing is asked"
+
+
+@pytest.mark.parametrize(
+    ("answers", "ended_as", "orders"),
+    [
+        ([False, True], ["refused", "updated"], [(OTHER, False)]),
+        ([True, True], ["updated", "updated"], [(UUID, True), (OTHER, False)]),
+        ([True, False], [], None),
+    ],
+)
+def test_a_person_decides_about_an_image_of_another_board_for_that_board_alone(
+    updating: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    answers: list[bool],
+    ended_as: list[str],
+    orders: list[tuple[bytes, bool]] | None,
+) -> None:
+    question, asked, left = "The image is for finger/r1, the board is a thumb.", list[str](), list(answers)
+    monkeypatch.setattr(App, "interactive", property(lambda _app: True))
+    monkeypatch.setattr(App, "ask_yes_no", lambda _app, question: (asked.append(question), left.pop(0))[1])
+    plans = {UUID: plan(question=question), OTHER: plan(OTHER)}
+    ends = [ended("updated", uuid=uuid) for uuid, _ in orders or ()]
+    outcome, done = updating(plans, ends)
+    boards = "1 board" if len(ends) == 1 else "2 boards"
+    assert asked == [f"{question} Install it all the same?", f"Install 1.4.0 on {boards}?"]
+    plans_shown = [line.split()[2] for line in outcome.err.splitlines() if line.startswith("Plan for ")]
+    assert plans_shown == [f"{uuid.hex()}:" for uuid, agreed in ((UUID, answers[0]), (OTHER, True)) if agreed]
+    if orders is None:
+        assert (outcome.code, done.given) == (6, []), "no board was touched"
+        assert "Cancelled. Nothing was changed." in outcome.err
+        return
+    assert [(uuid, order.other_board) for uuid, order in done.given[2]] == orders
+    assert outcome.code == (6 if "refused" in ended_as else 0)
+    hint = "\n  → If it is the right one all the same: --other-board\n"
+    assert (f"Error ({NODE}): {question}{hint}" in outcome.err) is ("refused" in ended_as)
+    counts = "1 updated, 1 refused" if "refused" in ended_as else "2 updated"
+    assert outcome.out.splitlines()[-1].startswith(f"{counts} in ")
+
+
+def test_of_several_boards_a_terminal_shows_a_row_each_and_how_many_ended(home: Path) -> None:
+    table = _ProgressTable(App(home=home, quiet=True), [UUID, OTHER, THIRD])
+
+    def rows() -> list[list[str]]:
+        out = Screen()
+        Console(file=out, width=120, color_system=None, force_terminal=False).print(table._render())
+        return [line.split() for line in out.getvalue().splitlines()]
+
+    try:
+        assert rows() == [
+            ["board"], [NODE, "waits"], [OTHER.hex(), "waits"], [THIRD.hex(), "waits"], ["0", "of", "3"],
+        ]  # fmt: skip
+        first, second = table.reporter_of(UUID), table.reporter_of(OTHER)
+        first.started("agree")
+        second.started("upload")
+        second.written(3500, 7000)
+        assert rows()[1:3] == [[NODE, "agree"], [OTHER.hex(), "upload", "50", "%"]]
+        first.notice(Notice("retry", "The board is [b]busy[/b]."))
+        second.notice(Notice("idle", "Nothing."))
+        assert rows()[1:3] == [
+            [NODE, "waits", "The", "board", "is", "[b]busy[/b]."],
+            [OTHER.hex(), "upload", "50", "%"],
+        ]
+        table.ended(ended("lost", BoardLostError("It is away.", hint="Look.")))
+        table.ended(ended("updated", uuid=OTHER))
+        assert rows()[1:] == [
+            [NODE, "lost", "It", "is", "away.", "Look."],
+            [OTHER.hex(), "updated", "12.3", "s"],
+            [THIRD.hex(), "waits"],
+            ["2", "of", "3"],
+        ]
+    finally:
+        table.close()
+
+
+def test_on_a_terminal_the_last_table_stays_and_no_board_has_a_line_besides(
+    updating: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    plans = {UUID: plan(), OTHER: plan(OTHER)}
+    ends = [ended("updated"), ended("lost", BoardLostError("It is away.", hint="Look."), uuid=OTHER)]
+
+    def update(_station: Any, _links: Any, _orders: Any, reporter_of: Any, **_how: Any) -> Any:
+        reporter_of(UUID).started("upload")
+        yield from ends
+
+    outcome, _ = updating(plans, update, "--yes", terminal=True)
+    assert outcome.out.split()[:4] == ["1", "updated,", "1", "lost"]
+    last = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", outcome.err.replace("\r", "\n")).splitlines()
+    shown = [line.split() for line in last if line.strip()][-3:]
+    assert shown == [
+        [NODE, "updated", "12.3", "s"],
+        [OTHER.hex(), "lost", "It", "is", "away.", "Look."],
+        ["2", "of", "2"],
+    ]
+    one, _ = updating({UUID: plan()}, [ended("updated")], "--yes", terminal=True)
+    assert (NODE in one.out, "1 of 1" in one.err) == (True, False), "one board needs no table"
 
 
 def test_a_dry_run_of_several_boards_counts_them(updating: Any) -> None:

@@ -18,6 +18,9 @@ UUID = bytes.fromhex("8d4d9da65281f7000000")
 LONG = "the left knee of the third robot in hall B, at the very end of the row, behind the crane, and then to the right"
 
 
+DONE = "ALL BOARDS ARE DONE."
+
+
 @dataclass
 class Batch:
     """Fifty boards; the next one is named by its order, its UUID or its key."""
@@ -78,6 +81,14 @@ def failed(number: int, error: TedsProvisionError) -> BoardResult:
 )
 def test_it_says_what_to_do_now(next_row: SheetRow | None, message: str) -> None:
     assert message in Terminal(Batch(next_row=next_row)).lines
+
+
+@pytest.mark.parametrize(
+    ("of_a_job", "passed", "words"), [(True, 49, "TAP THE NEXT BOARD"), (True, 50, DONE), (False, 49, DONE)]
+)
+def test_a_job_goes_on_until_as_many_boards_passed_as_it_has(of_a_job: bool, passed: int, words: str) -> None:
+    lines = Terminal(Batch(passed=passed, of_a_job=of_a_job)).lines
+    assert f">>> {words}" in lines
 
 
 def test_a_board_that_did_not_pass_is_asked_for_by_its_uuid() -> None:

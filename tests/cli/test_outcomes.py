@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import click
 import pytest
@@ -12,6 +14,7 @@ from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import LiveReporter, tidy
+from teds_provision.cli.station import vault as vault_command
 from teds_provision.cli.terminal_operator import TerminalOperator
 from teds_provision.errors import NotAuthenticError
 from teds_provision.links import Notice
@@ -22,8 +25,10 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.provisioning.sign import SignOrder, sign_image
+from teds_provision.station.station import Station
 from teds_provision.station.store.lock import StoreLock
 from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.vault import agent
 
 from ..bench import PASSPHRASE, Board, make_station, talk
 from .shell import call, clean_environment, spawn
@@ -212,3 +217,50 @@ def test_a_home_that_takes_no_lock_is_reported_as_a_store_that_fails(
     outcome = call(home, *words)
     assert outcome.code in (2, 7), outcome
     assert lock.rstrip("/") in outcome.err
+
+
+def test_a_keystore_that_unlocks_itself_has_nothing_to_keep_in_memory(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agent, "KINDS", ("pkcs11",))
+    done = call(home, "--json", "unlock")
+    assert (done.code, done.json) == (0, {"unlocked": False, "until": None, "keystore": "file"})
+    assert call(home, "unlock").out == (
+        "Nothing to do: this station's keys are in the file, which handles unlocking itself.\n"
+    )
+
+
+def test_a_token_with_a_pin_pad_leaves_nothing_to_keep_in_memory(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[Any] = []
+    monkeypatch.setattr(agent, "start", lambda *given: started.append(given))
+    monkeypatch.setattr(Station, "vault", property(lambda _station: SimpleNamespace(opener=lambda: None)))
+    refused = call(home, "--json", "unlock")
+    assert (refused.code, refused.json["error"]["message"], started) == (
+        2, "The token has its own PIN pad, so there is nothing to keep in memory.", [],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("span", "taken"), [("0s", False), ("1s", True), ("12h", True), ("43201s", False)])
+def test_a_vault_stays_open_for_a_second_to_twelve_hours(
+    home: Path, monkeypatch: pytest.MonkeyPatch, span: str, taken: bool
+) -> None:
+    started: list[Any] = []
+    monkeypatch.setattr(agent, "start", lambda *given: started.append(given))
+    done = call(home, "--json", "unlock", "--for", span)
+    assert (done.code, len(started)) == ((0, 1) if taken else (2, 0))
+    if taken:
+        assert (started[0][1], started[0][3]) == ("file", 1 if span == "1s" else 43200)
+    else:
+        assert done.json["error"]["message"] == f"The vault can stay unlocked for 1 s to 12 h, not {span}."
+
+
+@pytest.mark.parametrize(("damaged", "keys"), [(0, "0 keys"), (2, "2 keys"), (1, "1 key")])
+def test_keys_that_no_master_key_opens_are_named_after_a_rewrap(
+    home: Path, monkeypatch: pytest.MonkeyPatch, damaged: int, keys: str
+) -> None:
+    monkeypatch.setattr(vault_command, "rewrap_store", lambda _station: SimpleNamespace(damaged=damaged, keys=5))
+    done = call(home, "--json", "vault", "rewrap")
+    assert (done.code, done.json) == (0, {"keystore": "file", "rewrapped": 5, "damaged": damaged})
+    words = f"Warning: {keys} in the store cannot be decrypted with any master key; run teds-provision doctor.\n"
+    assert done.err == (words if damaged else "")
+    assert call(home, "vault", "rewrap").out == "Rewrapped 5 keys under a new master key in the file keystore.\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -12,7 +13,9 @@ from typing import Any
 
 import pytest
 
-from teds_provision import provisioning
+from teds_provision import firmware_image, provisioning
+from teds_provision.cli.context import App
+from teds_provision.cli.rendering import firmware_words
 from teds_provision.errors import (
     NodeSilentError,
     NotAuthenticError,
@@ -21,6 +24,7 @@ from teds_provision.errors import (
     UnprovenError,
 )
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.provisioning.batch import ProvisionPlan, ProvisionRequest
 from teds_provision.provisioning.batch_sheet import BatchTotals, BoardResult, DeclinedError
 from teds_provision.provisioning.build import UnrequestedChangeError
@@ -28,7 +32,9 @@ from teds_provision.provisioning.identify import IdentifiedNode
 from teds_provision.provisioning.image_file import VerifyReport
 from teds_provision.provisioning.progress import NOTHING, StepResult
 from teds_provision.provisioning.provision import ProvisionResult
+from teds_provision.provisioning.update import BoardUpdate, UpdatePlan
 from teds_provision.shapes.verdict import Check, Verification
+from teds_provision.station.firmware import FirmwareReading, KnownFirmware
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 
@@ -350,6 +356,125 @@ def test_options_of_provision_that_do_not_go_together(running: Any, words: list[
     assert (outcome.code, run.unlocked) == (2, False)
 
 
+@pytest.mark.parametrize("words", [["--firmware-key", "o.pem"], ["--firmware", "a.bin", "--dry-run"]])
+def test_firmware_is_for_one_board_and_the_refusal_says_how_many_get_it(running: Any, words: list[str]) -> None:
+    outcome, _ = running(Run([board()]), *words, as_json=True)
+    assert outcome.json["error"] == {
+        "code": "usage",
+        "message": "--firmware installs an image on one board; --firmware-key goes with it.",
+        "hint": "Many boards: whitelist add, agree, update --match EXPR IMAGE, provision. Plan: update --dry-run.",
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "message", "hint"),
+    [
+        (["--adopt", "--batch", "b.csv"], "The sheet or job already defines what each board gets.", "Drop --adopt."),
+        (
+            ["--operator", "Ann"],
+            "--calibrations, --operator, --files, --only, --label-to and --scan require a job.",
+            "Add --job FILE, or --evidence.",
+        ),
+    ],
+)
+def test_an_option_that_goes_with_no_other_is_refused_in_words(
+    running: Any, words: list[str], message: str, hint: str
+) -> None:
+    outcome, _ = running(Run([board()]), *words, as_json=True)
+    assert (outcome.code, outcome.json) == (2, {"error": {"code": "usage", "message": message, "hint": hint}})
+
+
+WRONG = "The image is for finger/r1, the board is of no known type."
+
+
+@pytest.mark.parametrize(
+    ("question", "answers", "stage", "words", "ended", "code", "course"),
+    [
+        ("", [], "upload", ["--yes"], None, 0, [False]),
+        ("", [True], "upload", [], None, 0, ["Install 1.4.0 on board {}?", False]),
+        ("", [False], "upload", [], None, 6, ["Install 1.4.0 on board {}?"]),
+        ("", None, "upload", [], None, 6, []),
+        ("", None, "nothing", [], None, 0, []),
+        (WRONG, None, "upload", ["--yes"], None, 6, []),
+        (WRONG, [False], "upload", ["--yes"], None, 6, [WRONG + " Install it all the same?"]),
+        (WRONG, [True], "upload", ["--yes"], None, 0, [WRONG + " Install it all the same?", True]),
+        ("", [], "upload", ["--yes"], NodeSilentError("It is silent."), 5, [False]),
+    ],
+)
+def test_a_board_gets_its_firmware_first_if_a_person_agrees(
+    running: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    question: str,
+    answers: list[bool] | None,
+    stage: Any,
+    words: list[str],
+    ended: TedsProvisionError | None,
+    code: int,
+    course: list[Any],
+) -> None:
+    image: Any = SimpleNamespace(version_text="1.4.0")
+    plan, done, left = UpdatePlan(UUID, Any, stage, 7, 1.0, (), question), list[Any](), list(answers or [])
+
+    def ask(_app: App, asked: str) -> bool:
+        done.append(asked)
+        return left.pop(0)
+
+    def update_boards(_station: Any, links: Any, orders: Any, reporter_of: Any) -> Iterator[BoardUpdate]:
+        [(uuid, order)] = orders
+        assert (uuid, order.image, links.via_chosen, reporter_of(uuid) is not None) == (UUID, image, True, True)
+        done.append(order.other_board)
+        yield BoardUpdate(UUID, "lost" if ended else "updated", "1.3.0", 7, 1.0, ended)
+
+    monkeypatch.setattr(App, "interactive", property(lambda _app: answers is not None))
+    monkeypatch.setattr(App, "ask_yes_no", ask)
+    monkeypatch.setattr(firmware_image, "load_firmware_image", lambda *_: image)
+    monkeypatch.setattr(provisioning.provision, "key_board_at", lambda *_, **__: UUID)
+    monkeypatch.setattr(provisioning.update, "plan_update", lambda *_: plan)
+    monkeypatch.setattr(provisioning.update, "update_boards", update_boards)
+    outcome, run = running(Run([board()]), "--firmware", tmp_path / "a.bin", *words)
+    assert (outcome.code, done) == (code, [one.format(NODE) if isinstance(one, str) else one for one in course])
+    assert run.request.node == (NODE if code == 0 else None), "then that board is provisioned, whichever was meant"
+    if question and code:
+        assert f"Error: {question}\n  → update {NODE} IMAGE --other-board, then provision.\n" in outcome.err
+
+
+def test_a_datasheet_that_was_not_adopted_is_shown_with_its_findings(running: Any) -> None:
+    brought = FactoryDatasheet(IMAGE, "finger", (), ("It is overdue.",), ("It is old.",))
+    refusal = NotAdoptedError("It is not approved.", brought, hint="Check it.")
+    outcome, _ = running(Run(failure=refusal), "--adopt", as_json=True)
+    assert (outcome.code, outcome.json, outcome.err) == (
+        6,
+        {
+            "findings": [
+                {"severity": "error", "message": "It is overdue."},
+                {"severity": "warning", "message": "It is old."},
+            ],
+            "error": {"code": "not-adopted", "message": "It is not approved.", "hint": "Check it."},
+        },
+        "",
+    )
+    people, _ = running(Run(failure=refusal), "--adopt")
+    assert (people.code, people.out) == (6, "")
+    assert people.err.splitlines() == [
+        f"Node {NODE} brought its own datasheet: finger",
+        "  error: It is overdue.",
+        "  warning: It is old.",
+        "Error: It is not approved.",
+        "  → Check it.",
+    ]
+
+
+def test_of_many_boards_the_changes_that_nobody_named_are_listed_with_the_refusal(running: Any) -> None:
+    change: Any = SimpleNamespace(text="Channel 1: the range becomes 0 to 80 mm.")
+    refusal = UnrequestedChangeError("It would change.", (change,), hint="Name it.")
+    outcome, _ = running(Run([board(error=refusal)]), "--watch", as_json=True)
+    [line] = lines_of(outcome)
+    assert (line["changes"], line["error"]["code"]) == ([change.text], "not-named")
+    people, _ = running(Run([board(error=refusal)]), "--watch")
+    assert change.text not in people.out
+
+
 # -- verify UUID -------------------------------------------------------------------------------------------------------
 
 
@@ -402,3 +527,31 @@ def test_what_is_accepted_of_a_node_is_not_accepted_of_many_files(
     (tmp_path / "folder").mkdir()
     for what in (["a.json", "b.json"], [tmp_path / "folder"]):
         assert call(home, "--json", "verify", *what, *option).code == 2
+
+
+@pytest.mark.parametrize(
+    ("verified", "ends", "colour"), [(GOOD, None, "32"), (FORGED, NotAuthenticError("Forged."), "31")]
+)
+def test_a_terminal_shows_what_was_checked_as_a_table_in_colours(
+    home: Path, monkeypatch: pytest.MonkeyPatch, verified: Verification, ends: TedsProvisionError | None, colour: str
+) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    skipped = replace(verified, checks=(*verified.checks, Check("calibration", "skipped", "no [bold]calibration[/]")))
+    runs = KnownFirmware(FirmwareReading(None, False), "not-reported")
+    report = VerifyReport(skipped, (), ends, runs)
+    monkeypatch.setattr(provisioning.verify_node, "verify_at", lambda *_, **__: report)
+    shown = call(home, "verify", NODE, *NFC, terminal=True).out
+    assert f"\x1b[1;{colour}m{NODE}: {skipped.verdict}\x1b[0m" in shown
+    assert "\x1b[2mskipped\x1b[0m" in shown
+    assert f"\x1b[{'32mpassed' if colour == '32' else '1;31mfailed'}\x1b[0m" in shown
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", shown)
+    assert plain.startswith("check ")
+    lines = [line.split() for line in plain.splitlines() if line.strip()]
+    assert lines == [
+        ["check", "result", "found"],
+        *([check.name, check.result, *check.why.split()] for check in skipped.checks),
+        [f"{NODE}:", *skipped.verdict.split()],
+        ["firmware:", *firmware_words(runs.to_json()).split()],
+    ]

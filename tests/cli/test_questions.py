@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,7 +19,7 @@ import pytest
 import teds_provision
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import LineReporter, LiveReporter, reporter_for
-from teds_provision.cli.terminal_operator import TerminalOperator
+from teds_provision.cli.terminal_operator import TerminalOperator, show_brought
 from teds_provision.errors import NotWhitelistedError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
@@ -28,11 +30,15 @@ from teds_provision.provisioning.build import UnrequestedChangeError
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Holder
+from teds_provision.teds.channel import ChannelKind
 from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.sheet import Sheet
 from tests.bench import PASSPHRASE
 from tests.parsed import parsed
 
 from .shell import call
+from .shown import image_of
 
 UUID, KEY = "8d4d9da65281f7000000", "0123456789abcdef" * 4
 OTHER = KEY[:20] + "f" + KEY[21:]
@@ -309,6 +315,36 @@ def test_a_datasheet_that_a_board_brought_is_shown_before_it_is_signed(
     with pytest.raises(DeclinedError, match="was not signed"):
         TerminalOperator(app(), yes=False).adopt(brought)
     assert len(asked) == 2
+
+
+def test_each_channel_of_a_datasheet_that_a_board_brought_is_one_line(
+    app: Callable[..., App], capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = Image(WHO.uuid, load_profile("magnetic-angular-position-sensor").build(WHO.uuid).blocks)
+    [first, *_] = Sheet.from_image(image).channels
+    [calibrated, *_] = Sheet.from_image(Image.from_json(image_of("magnetic-angular-position-sensor"))).channels
+    shown: dict[tuple[Any, ...], str] = {
+        (): "angle, sensor, 0 ° to 180 °",
+        (("name", ""),): "(no name), sensor, 0 ° to 180 °",
+        (("kind", None),): "angle, of unknown kind, 0 ° to 180 °",
+        (("kind", ChannelKind.ACTUATOR),): "angle, actuator, 0 ° to 180 °",
+        (("uncertainty", math.pi / 90),): "angle, sensor, 0 ° to 180 °, ± 2 °",
+        (("uncertainty", 0.0),): "angle, sensor, 0 ° to 180 °",
+        (("calibration", calibrated.calibration),): "angle, sensor, 0 ° to 180 °, calibrated 2020-01-02",
+    }
+    base = replace(first, name="angle", low=0.0, high=math.pi, uncertainty=0.0)
+    channels = tuple(replace(base, **dict(changes)) for changes in shown)
+    show_brought(app(), FactoryDatasheet(image, "", channels))
+    head, *lines = capsys.readouterr().err.splitlines()
+    assert head == f"Node {UUID} brought its own datasheet: (no name)"
+    assert lines == [f"  channel 1: {line}" for line in shown.values()]
+    for count, last in ((20, "  channel 20: "), (23, "  and 3 more channels")):
+        many = tuple(replace(base, number=number) for number in range(1, count + 1))
+        findings = tuple(f"finding {number}" for number in range(1, 30))
+        show_brought(app(), FactoryDatasheet(image, "", many, findings))
+        _, *lines = capsys.readouterr().err.splitlines()
+        assert [line for line in lines if "finding" not in line][-1].startswith(last)
+        assert [line for line in lines if "finding" in line] == [f"  error: finding {one}" for one in range(1, 21)]
 
 
 @pytest.mark.parametrize("what", ["low_battery", "jump"])

@@ -13,6 +13,7 @@ import pytest
 from teds_provision.cli import start
 from teds_provision.doctor import fleet
 from teds_provision.doctor.checks import Finding
+from teds_provision.errors import LinkError, UsageError
 from teds_provision.measure.link_survey import LinkSurvey
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
@@ -263,3 +264,14 @@ def test_what_each_line_says_where_little_is_there() -> None:
     unnamed = {**ARM, "name": None, "link": "ble:hci0", "verdict": None}
     assert start._next({"links": [], "nodes": [unnamed]}) == "teds-provision verify 8d"
     assert start._next({"links": [], "nodes": [{**ARM, "name": "my arm"}]}) == "teds-provision measure 'my arm'"
+
+
+@pytest.mark.parametrize("error", [LinkError("It ended."), ConnectionResetError(), UsageError("Its file is bad.")])
+def test_a_service_that_ends_meanwhile_is_none(station: Station, error: Exception) -> None:
+    def status() -> dict[str, Any]:
+        raise error
+
+    app: Any = SimpleNamespace(running_service=lambda timeout: nullcontext(SimpleNamespace(status=status)))
+    assert start._of_service(app, station) is None
+    app.running_service = lambda timeout: None
+    assert start._of_service(app, station) is None

@@ -15,6 +15,7 @@ import pytest
 from teds_provision.cli import main, stdout
 from teds_provision.cli.context import App
 from teds_provision.cli.stdout import CleanText
+from teds_provision.errors import StoreError
 from teds_provision.sanitize import printable, sanitize, sanitize_json
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
@@ -212,3 +213,36 @@ def test_after_a_full_stdout_what_is_buffered_goes_nowhere(
         assert main._system_error([], failure.value) == 7
         full.flush()
     assert capsys.readouterr().err == "Error: Cannot write the result to stdout: No space left on device.\n"
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left"), ValueError("closed file")])
+def test_what_a_full_or_closed_stdout_does_not_take_ends_as_lost_output(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def flush() -> None:
+        raise error
+
+    silenced: list[bool] = []
+    monkeypatch.setattr(stdout, "silence", lambda: silenced.append(True))
+    monkeypatch.setattr(sys, "stdout", SimpleNamespace(flush=flush))
+    assert stdout.ended(3, None, purpose=lambda: stdout.Purpose(only_shows=True, must_print=True)) == 3
+    assert silenced == [True]
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_result_that_stdout_does_not_take_is_an_error_for_a_program_and_a_note_for_people(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
+    monkeypatch.setattr(App, "current", None)
+    app = App(home=tmp_path, as_json=as_json)
+    for give in (lambda: app.emit({"a": 1}, "a"), lambda: app.lines(["a"])):
+        with open("/dev/full", "w") as full, monkeypatch.context() as patch:
+            patch.setattr(sys, "stdout", full)
+            if as_json:
+                with pytest.raises(StoreError, match="Cannot write the result to stdout: No space left") as refused:
+                    give()
+                assert refused.value.hint == "The work itself is done. Free some space before the next run."
+            else:
+                give()  # what is still buffered then goes nowhere, so that the end of the block does not fail
+    note = "Cannot write the result to stdout: No space left on device.\n"
+    assert capsys.readouterr().err == ("" if as_json else note * 2)

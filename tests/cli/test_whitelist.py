@@ -229,3 +229,17 @@ def test_the_list_unlocks_the_vault_before_it_takes_the_store(home: Path, monkey
         done.clear()
         assert call(home, "whitelist", *words).code == 0
         assert done[:2] == ["unlock", "lock"], words
+
+
+def test_an_eui_64_is_a_uuid_unless_a_known_node_begins_with_it(home: Path) -> None:
+    eui = "00:12:4b:00:14:b5:d9:99"
+    assert call(home, "--json", "whitelist", "add", eui).code == 0
+    listed = call(home, "--json", "whitelist", "list").json["whitelist"]
+    assert [node["uuid"] for node in listed] == ["fffe00124b0014b5d999"]
+    known = "00124b0014b5d9990000"
+    assert call(home, "whitelist", "add", known).code == 0
+    assert call(home, "whitelist", "add", eui.replace(":", ""), "--name", "first").code == 0
+    named = call(home, "--json", "whitelist", "list").json["whitelist"]
+    assert {node["uuid"]: node["name"] for node in named} == {"fffe00124b0014b5d999": None, known: "first"}
+    unknown = call(home, "--json", "whitelist", "add", "nobody")
+    assert (unknown.code, "nobody" in unknown.json["error"]["message"]) == (3, True)
