@@ -14,6 +14,7 @@ from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import DecodedTeds, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
+from teds_provision.teds.codec.values import read_text
 from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described, name_among
@@ -151,7 +152,7 @@ def _flat(decoded: DecodedTeds) -> dict[_Path, Field]:
     walk(decoded.fields, ())
     for number, text in enumerate(decoded.text):
         path = (("text", number),)
-        out[path] = Field(0, "text", text, text, 0)
+        out[path] = Field(0, "text", read_text(text), text, 0)
     return out
 
 

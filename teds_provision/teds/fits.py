@@ -270,10 +270,7 @@ def _term(text: str) -> Term:
             f'"{name}" is no quantity that is known here.',
             hint=f'Did you mean "{near[0]}"?' if near else f"Known are {', '.join([*_PROPERTIES, *QUANTITIES])}.",
         )
-    try:
-        value = float(match[3])
-    except ValueError as error:
-        raise BadDataError(f'"{match[3]}" in "{text.strip()[:60]}" is not a number.') from error
+    value = float(match[3])
     if not math.isfinite(value):
         raise BadDataError(f'"{match[3]}" in "{text.strip()[:60]}" is too large.')
     unit = parse_unit((match[4] or _UNITLESS).strip())
@@ -308,8 +305,6 @@ def _table(name: str, table: object, file: str) -> Requirement:
     quantity = key if key in QUANTITIES else ""
     try:
         terms = tuple(_entry(what, value, quantity) for what, value in table.items())
-        if len(terms) > LIMITS.terms:
-            raise BadDataError(f"it has {len(terms)} bounds; {LIMITS.terms} are the most.")
         return _with_fitting_units(Requirement(terms, quantity, "" if quantity else name))
     except BadDataError as error:
         raise BadDataError(f"{file}: [{name[:40]}]: {error.message}", hint=error.hint) from error

@@ -178,6 +178,50 @@ def test_what_is_compared() -> None:
     assert misfit(calibration, replace(had, described=False), had, None) == "nothing says for what channel it was made"
 
 
+def test_samples_that_nothing_describes_are_compared_as_far_as_they_can_be() -> None:
+    calibration, had = angle()
+    unknown, floats = replace(had, sample=None), replace(had, sample=SampleForm(1, 4))
+    for before, now, why in (
+        (unknown, had, "nothing says how a sample is coded"),
+        (had, unknown, "nothing says how a sample is coded"),
+        (unknown, unknown, ""),
+        (floats, floats, ""),  # floats have no range of raw values
+    ):
+        assert misfit(calibration, before, now, None) == why
+    own = load_profile(ANGLE).channel(1)
+    assert own is not None
+    without = replace(own.calibration, raw_range=None, method="")
+    plain = {**own.fields, "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 24}}
+    for raw, why in ((None, ""), ((0.0, 65535.0), "it was made for another range of raw values")):
+        of = replace(own, fields=plain, calibration=replace(without, raw_range=raw))
+        assert misfit(calibration, floats, floats, of) == why
+    ranged = replace(calibration, raw_range=(0.0, 65535.0))
+    of = replace(own, fields=plain, calibration=without)
+    assert misfit(ranged, floats, floats, of) == "it was made for another range of raw values"
+
+
+@pytest.mark.parametrize(
+    ("raw", "why"),
+    [
+        ((-100.0, 80000.0), ""),
+        ((-5.0, 70000.0), ""),  # narrower than before, and yet wider than the points
+        ((0.0, 65535.0), ""),
+        ((0.0, 65534.0), ""),  # one raw value is a rounding
+        ((1.0, 65535.0), ""),
+        ((0.0, 65533.0), "it covers raw 0 to 65535, and this channel gives raw 0 to 65533"),
+        ((2.0, 65535.0), "it covers raw 0 to 65535, and this channel gives raw 2 to 65535"),
+        ((-102.0, 80000.0), "it was made for raw -100 to 80000, and this channel gives raw -102 to 80000"),
+        ((-100.0, 80002.0), "it was made for raw -100 to 80000, and this channel gives raw -100 to 80002"),
+    ],
+)
+def test_points_beyond_another_range_of_raw_values_do_not_fit(raw: tuple[float, float], why: str) -> None:
+    calibration, had = angle()
+    own = load_profile(ANGLE).channel(1)
+    assert own is not None
+    of = replace(own, calibration=replace(own.calibration, raw_range=raw, method=""))
+    assert misfit(replace(calibration, raw_range=(-100.0, 80000.0)), had, had, of) == why
+
+
 def test_a_method_that_the_type_asks_for_is_compared() -> None:
     calibration, had = angle()
     own = load_profile(ANGLE).channel(1)

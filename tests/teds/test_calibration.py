@@ -20,6 +20,8 @@ from teds_provision.teds.calibration import (
     METHODS,
     Calibration,
     CalibrationInput,
+    PreparedCurve,
+    PreparedInverse,
     Residuals,
     describe_calibration,
     evaluate,
@@ -140,6 +142,51 @@ def test_what_does_not_fit_together_is_refused(
 
 
 # --- fits
+
+
+@pytest.mark.parametrize("degree", [-1, 256])
+def test_the_degree_of_an_input_is_an_octet(degree: int) -> None:
+    with pytest.raises(BadDataError) as refused:
+        CalibrationInput(1, degree, (0.0, 1.0), (0.0,))
+    assert refused.value.message == f"The degree of a calibration input goes from 0 to 255, not {degree}."
+    assert [CalibrationInput(1, just, (0.0, 1.0), (0.0,)).degree for just in (0, 255)] == [0, 255]
+
+
+@pytest.mark.parametrize("ends", [(0, math.inf), (-math.inf, 1), (math.nan, 1), (0, math.nan), (1, 1), (2, 1)], ids=str)
+def test_a_curve_is_inverted_between_two_finite_ends_in_order(ends: tuple[float, float]) -> None:
+    with pytest.raises(BadDataError, match=r"^A calibration is only inverted between two finite ends\.$"):
+        PreparedInverse(PreparedCurve(SPLINE), *ends)
+
+
+@pytest.mark.parametrize("given", [0, 2])
+def test_a_curve_takes_one_value_for_each_input(given: int) -> None:
+    with pytest.raises(BadDataError) as refused:
+        evaluate(SPLINE, *([1.0] * given))
+    assert refused.value.message == f"The calibration of channel 1 takes 1 inputs, not {given}."
+
+
+def test_a_table_of_which_a_point_cannot_be_left_out_has_no_such_differences() -> None:
+    """Without one of three points, two are left: too few for a polynomial of degree 2."""
+    three = fit([(0, 0), (1, 2), (2, 8)], "polynomial", channel=1)
+    assert three.inputs[0].degree == 2
+    assert left_out(three) == ()
+    assert left_out(fit([(0, 0), (1, 3), (2, 8)], "linear", channel=1)) == pytest.approx((-1.0,))
+    assert left_out(fit([(0, 0), (2, 8)], "linear", channel=1)) == ()
+
+
+def test_a_due_date_beyond_the_calendar_is_none() -> None:
+    late = replace(SPLINE, date=datetime(9999, 12, 1, tzinfo=UTC), interval=31 * 86400.0)
+    assert (late.due, late.overdue(datetime(9999, 12, 31, tzinfo=UTC))) == (None, False)
+    assert replace(late, interval=30 * 86400.0).due == datetime(9999, 12, 31, tzinfo=UTC)
+
+
+def test_a_date_beyond_the_calendar_in_a_teds_is_none() -> None:
+    """The 2024 edition has 48 bits of seconds; the last second of the year 9999 is 253402300799."""
+    for seconds, year in ((253402300799, 9999), (253402300800, None)):
+        moment = teds.TimeInstance(seconds, 0, False)
+        octets = teds.compose(5, [*SPLINE.fields(2024), ("LstCalDt", moment)], edition=2024)
+        found = from_decoded(teds.decode(octets), channel=1)
+        assert (found.date and found.date.year) == year
 
 
 def test_a_line_through_exact_points_is_found() -> None:

@@ -216,6 +216,25 @@ def test_a_mistake_in_a_csv_is_named_with_its_line(text: str, message: str) -> N
             "c.json",
             "c.json:4: degree: a whole number from 0 to 255 is expected, not 0.5.",
         ),
+        ("by = 'x'\n[slope]\na = 1\n", "c.toml", "c.toml:2: slope: a value is expected here, not a table."),
+        ('{"by": 1,\n"slope": {"a": 1}}', "c.json", "c.json:2: slope: a value is expected here, not a table."),
+        (
+            "by = 'x'\n[calibration]\nslope = 1\n",
+            "c.toml",
+            "c.toml:2: calibration: tables [[calibration]] are expected.",
+        ),
+        ("calibration = 3\n", "c.toml", "c.toml:1: calibration: tables [[calibration]] are expected."),
+        (
+            "slope = 1\nuncertainty = '1 qq'\n",
+            "c.toml",
+            'c.toml:2: uncertainty: "qq" is not a unit. Write it like "degree", "N",',
+        ),
+        (
+            "slope = 1\ninterval = '1 qq'\n",
+            "c.toml",
+            'c.toml:2: interval: "qq" is not a unit. Write it like "degree", "N",',
+        ),
+        ("slope = 1\nunit = 'qq'\n", "c.toml", 'c.toml:2: unit: "qq" is not a unit. Write it like "degree", "N",'),
         (
             "from,to,offset,c0\n0,1,0,5\n1,2,0,5\n3,4,0,6\n",
             "c.csv",
@@ -433,6 +452,20 @@ def test_a_line_without_boundaries_goes_over_raw_values_or_from_limit_to_limit()
     gripper = load_profile("gripper")
     ends = {n: read_calibrations("slope = 2", "c.toml", gripper, channel=n)[n].inputs[0].boundaries for n in (1, 2)}
     assert ends == {1: (0.0, pytest.approx(110.0)), 2: (0.0, 4095.0)}
+
+
+def test_a_line_without_boundaries_needs_a_raw_range(angle: Profile) -> None:
+    """Samples of floats have none: only what the file or the profile says can bound the line."""
+    own = angle.channels[0]
+    fields = {**own.fields, "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 24}}
+    floats = replace(
+        angle, channels=(replace(own, fields=fields, calibration=replace(own.calibration, raw_range=None)),)
+    )
+    with pytest.raises(BadDataError) as refused:
+        read_calibrations("by = 'x'\nslope = 1\n", "c.toml", floats)
+    assert refused.value.message == ("c.toml:1: boundaries: missing: the data model of the channel sets no raw range.")
+    found = read_calibrations("boundaries = [2, 9]\nslope = 1\n", "c.toml", floats)[1]
+    assert found.inputs[0].boundaries == (2.0, 9.0)
 
 
 def test_what_is_just_allowed(angle: Profile) -> None:

@@ -137,6 +137,14 @@ def test_a_power_that_a_teds_cannot_hold_and_a_sign_without_a_unit_are_refused(t
         parse_si_unit(text)
 
 
+def test_a_unit_has_at_most_256_characters() -> None:
+    with pytest.raises(BadDataError) as refused:
+        parse_si_unit(r"\metre" + " " * 245 + r"\metre")
+    assert refused.value.message == "A unit has at most 256 characters, this one 257."
+    assert parse_si_unit(r"\metre" + " " * 244 + r"\metre").units == parse_unit("m²").units
+    assert parse_si_unit(" " * 300 + r"\metre").units == parse_unit("m").units, "blanks around it are no part of it"
+
+
 # -- columns -----------------------------------------------------------------------------------------------------------
 
 
@@ -191,6 +199,25 @@ def test_columns_of_one_value_or_of_another_length_make_no_points() -> None:
 def test_slope_and_intercept_are_one_value_each(quantities: tuple[str, ...], coefficients: list[float] | None) -> None:
     found = items_of(read(table(*quantities)))
     assert [item.to_json()["coefficients"] for item in found] == ([] if coefficients is None else [coefficients])
+
+
+def test_an_item_of_coefficients_is_titled_and_shown_by_its_unit() -> None:
+    (item,) = items_of(read(table(listed("a_coefficients", "1 -2.5 1e-10"))))
+    assert item.title == "Points of channel 1: coefficients, °"
+    assert points_of(item) == [("c0", "1"), ("c1", "-2.5"), ("c2", "1e-10")]
+    (plain,) = items_of(read(table(single("slope", "2", r"\one"), single("intercept", "1", r"\one"))))
+    assert plain.title == "Points of channel 1: coefficients, plain numbers"
+    assert points_of(plain) == [("c0", "1"), ("c1", "2")]
+    found = table(listed("x_coefficients", "1 2")).replace("<dcc:list", "<dcc:list refType='y_beforeAdjustment'")
+    (stated,) = items_of(read(found))
+    assert stated.title == "Points of channel 1, as found: coefficients, °"
+
+
+def test_points_that_relate_values_to_another_quantity_do_not_fit() -> None:
+    inside = table(listed("measuredValue", "1 2", r"\volt"), listed("referenceValue", "3 4"))
+    with pytest.raises(BadDataError) as refused:
+        calibrated(inside, angle())
+    assert refused.value.message.endswith("(degree): t: it relates the values to V, not to raw numbers.")
 
 
 def test_each_coefficient_must_be_one_of_a_raw_number() -> None:
@@ -395,6 +422,8 @@ def test_rows_are_a_table_if_they_are_alike() -> None:
     partly = columns(_row(single("a", "1", more=surer)), _row(single("a", "2", more=sure)), _row(single("a", "3")))
     assert partly == [((1.0, 2.0, 3.0), (6.0,))], "the largest is for all of them"
     assert columns(_row(single("a", "1"))) == [], "one row alone"
+    nested = _row(single("a", "1"), _row(single("b", "2")))
+    assert columns(nested, nested) == [], "a row that holds a list is a list of its own"
     assert columns(_row(single("a", "1")), _row(single("b", "3"))) == [], "another type"
     assert columns(_row(single("a", "1")), _row(single("a", "3", r"\metre"))) == [], "another unit"
     assert columns(_row(single("a", "1")), _row(listed("a", "3 4"))) == [], "more than one value"
@@ -484,6 +513,24 @@ def test_facts_of_a_certificate_at_their_edges() -> None:
     with pytest.raises(BadDataError, match="it is not one line of at most 200 printable characters"):
         read_with("B2-2026-0042", "9" * 201)
     assert read_with("B2-2026-0042", "9" * 200).number == "9" * 200
+    for just in ("2026-10-14", "2026-10-14Z", "2026-10-14+02:00", "2026-10-14-11:30"):
+        assert read_with(ends, f"{just}</dcc:endPerformanceDate>").calibrated == date(2026, 10, 14)
+    for text in ("20261014", "2026-10-14T00:00:00", "2026-10-14z", "2026-10-14 Z", "2026-10-14+2:00", "2026-10-32"):
+        with pytest.raises(BadDataError) as refused:
+            read_with(ends, f"{text}</dcc:endPerformanceDate>")
+        assert refused.value.message.endswith(f"endPerformanceDate: a date like 2026-10-31 is expected, not {text!r}.")
+    with pytest.raises(BadDataError, match=r"^c:\d+: endPerformanceDate: it is empty\.$"):
+        read_with(ends, "</dcc:endPerformanceDate>")
+    laboratory = "<dcc:content>Bench 2, robot laboratory</dcc:content>"
+    for empty in ("", "<dcc:content> </dcc:content>"):
+        with pytest.raises(BadDataError, match=r"^c:\d+: contact: its name is empty\.$"):
+            read_with(laboratory, empty)
+    begins = TEXT.index("<dcc:measurementResults>") + len("<dcc:measurementResults>")
+    without = TEXT[:begins] + TEXT[TEXT.index("</dcc:measurementResults>") :]
+    with pytest.raises(
+        BadDataError, match=r"^c:\d+: digitalCalibrationCertificate: it holds no measurement results\.$"
+    ):
+        read_certificate(without.encode(), "c")
     other = read_with("<dcc:issuer>manufacturer<", "<dcc:issuer>customer<").devices[0]
     assert (other.serial, other.identifications) == ("", (("customer", "S-1007"),))
 
@@ -506,6 +553,33 @@ def test_a_certificate_is_shown_whole() -> None:
     rows = points_of(long)
     assert (len(rows), rows[-1][0]) == (len(rows), "…")
     assert int(rows[-1][1].removesuffix(" more")) + len(rows) - 1 == 51
+
+
+def test_a_device_is_shown_with_its_serial_number_as_data() -> None:
+    for issuer, serial in (("manufacturer", "S-1007"), ("customer", None)):
+        octets = changed(ANGLE, ("<dcc:issuer>manufacturer<", f"<dcc:issuer>{issuer}<"))
+        shown = ShownCertificate.from_certificate(read_certificate(octets, "c.xml")).to_json()
+        assert shown["devices"] == [
+            {
+                "name": "magnetic angle sensor",
+                "manufacturer": "Example Sensors",
+                "model": "MA-16",
+                "serial": serial,
+                "identifications": [{"issuer": issuer, "value": "S-1007"}],
+            }
+        ]
+        assert (shown["issued"], shown["date"], shown["signature"]) == ("2026-11-26", "2026-10-12", "not checked")
+        assert (shown["country"], shown["signed"], shown["not_checked"], shown["warnings"]) == ("AT", False, [], [])
+        assert shown["conditions"] == [{"name": "Ambient temperature", "text": "23.1 °C"}]
+    undated = re.sub(r"\s*<dcc:issueDate>.*?</dcc:issueDate>", "", TEXT)
+    assert ShownCertificate.from_certificate(read_certificate(undated.encode(), "c")).to_json()["issued"] is None
+
+
+def test_a_condition_without_numbers_is_not_listed() -> None:
+    one = "<si:real>\n        <si:value>23.1</si:value>\n        <si:unit>\\degreecelsius</si:unit>\n       </si:real>"
+    text = "<dcc:noQuantity><dcc:content>dry</dcc:content></dcc:noQuantity>"
+    for inside in (text, "<si:real><si:value>23.1</si:value><si:unit>\\furlong</si:unit></si:real>"):
+        assert read_certificate(changed(ANGLE, (one, inside)), "c").conditions == ()
 
 
 def test_a_condition_is_shown_with_its_first_eight_numbers() -> None:
@@ -608,6 +682,31 @@ def test_a_certificate_is_of_the_newest_day_of_its_points_and_of_today_without_o
     assert "<dcc:release>v0</dcc:release>" in text
     plain = read_certificate(written("0,0\n1,1\n", Laboratory()).encode(), "c")
     assert (plain.calibrated, plain.number) == (date(2026, 11, 26), "teds-provision-2026-11-26-e3b0c44298fc1c14")
+
+
+def test_what_the_laboratory_states_of_itself_is_in_its_contact() -> None:
+    known = Laboratory(laboratory="Bench 2", email="bench@lab.example", phone="+43 1 2", city="Graz", street="Inn 1")
+    text = written("0,0\n1,1\n", replace(known, postcode="8010", country="AT", customer="Works"))
+    contact = text[text.index("<dcc:calibrationLaboratory>") : text.index("</dcc:calibrationLaboratory>")]
+    stated = re.findall(r"<dcc:(\w+)>([^<\s][^<]*)</dcc:\w+>", contact)
+    assert stated == [
+        ("content", "Bench 2"),
+        ("eMail", "bench@lab.example"),
+        ("phone", "+43 1 2"),
+        ("city", "Graz"),
+        ("countryCode", "AT"),
+        ("postCode", "8010"),
+        ("street", "Inn 1"),
+    ]
+    customer = text[text.index("<dcc:customer>") : text.index("</dcc:customer>")]
+    assert re.findall(r"<dcc:(\w+)>([^<\s][^<]*)</dcc:\w+>", customer) == [
+        ("content", "Works"),
+        ("content", "not stated"),
+    ]
+    plain = written("0,0\n1,1\n", Laboratory())
+    assert ("eMail" in plain, "phone" in plain, "city" in plain, "<dcc:countryCode>ZZ<" in plain) == (False,) * 3 + (
+        True,
+    )
 
 
 @pytest.mark.parametrize(("factor", "good"), [("1", True), ("10", True), ("0.99", False), ("10.1", False)])

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from typing import cast
 
 import pytest
+from cryptography import x509
 from lxml import etree
 
 from teds_provision.errors import BadDataError, NotAuthenticError
+from teds_provision.teds.dcc import signature
 from teds_provision.teds.dcc.read import DigitalCertificate
 from teds_provision.teds.dcc.signature import read_checked
 
@@ -176,6 +180,69 @@ def test_a_signers_certificate_that_is_not_valid_yet_is_refused() -> None:
     below, ca = signer_under_ca()
     with pytest.raises(NotAuthenticError, match="which is not trusted"):
         read(below.sign(ANGLE), ca, later=-20)
+
+
+def test_a_signature_without_the_signers_certificate_cannot_be_checked() -> None:
+    lab = signer()
+    signed = etree.fromstring(lab.sign(ANGLE, xades=False))
+    (holder,) = signed.iter(f"{DS}KeyInfo")
+    holder.getparent().remove(holder)
+    bare = etree.tostring(signed)
+    why = "it brings no X.509 certificate."
+    assert read(bare).unchecked == (f"The signature cannot be checked: {why}",)
+    with pytest.raises(NotAuthenticError) as refused:
+        read(bare, lab.certificate)
+    assert refused.value.message == f"The signature of c.xml cannot be checked: {why}"
+
+
+@pytest.mark.parametrize("found", [[], ["other"], ["root", "root"], ["root", "other", "root"]], ids=str)
+def test_a_signature_covers_the_whole_certificate_once(found: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever signxml takes for the signed parts: one of them is the whole document, or nothing is read."""
+    lab = signer()
+    octets = lab.sign(ANGLE)
+    parts = {"root": etree.fromstring(octets), "other": etree.fromstring("<a/>")}
+    monkeypatch.setattr(signature, "_results", lambda *_: [parts[name] for name in found])
+    for trusted in ((), (lab.certificate,)):
+        with pytest.raises(NotAuthenticError, match="does not cover the whole certificate"):
+            read(octets, *trusted)
+
+
+@pytest.mark.parametrize(
+    ("stated", "usable"),
+    [
+        ("2000-01-01T00:00:00+00:00", False),  # before the signer's certificate
+        ("soon", False),
+        ("", False),
+        ("1969-12-31T23:59:59+00:00", False),
+        ("9000-01-01T00:00:00+00:00", False),
+        ("{}T00:00:00+00:00", True),
+        ("{}T00:00:00Z", True),
+        ("{}T00:00:00", True),  # without a time zone: UTC
+    ],
+)
+def test_a_time_of_signing_that_is_none_saves_no_expired_signer(stated: str, usable: bool) -> None:
+    """A time within the certificate's days is taken, and then the signature, which covers it, is found bad."""
+    gone = signer("Expired long ago", (-900, -500))
+    octets = gone.sign(ANGLE)
+    (given,) = re.findall(rb"(?<=SigningTime>)[^<]+(?=<)", octets)
+    within = (datetime.now(UTC) - timedelta(days=700)).date()
+    forged = octets.replace(given, stated.format(within).encode())
+    with pytest.raises(NotAuthenticError, match="is bad" if usable else "not valid any more, or not yet"):
+        read(forged, gone.certificate)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [ValueError("x"), x509.DuplicateExtension("x", x509.KeyUsage.oid)],
+    ids=lambda damage: type(damage).__name__,
+)
+def test_a_key_whose_use_cannot_be_read_may_not_sign(damage: Exception) -> None:
+    class Damaged:
+        @property
+        def extensions(self) -> x509.Extensions:
+            raise damage
+
+    assert not signature._may_sign(cast(x509.Certificate, Damaged()))
 
 
 def test_a_signature_by_someone_unknown_states_what_was_not_checked_either() -> None:

@@ -138,9 +138,44 @@ def test_refusals_name_the_field(fields: object, named: str) -> None:
         teds.compose(1, fields)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("numbers", [[], [1], [1, 2, 3]])
+def test_a_pair_has_two_numbers(numbers: list[float]) -> None:
+    with pytest.raises(BadDataError) as refused:
+        teds.compose(3, {**KELVIN, "DAngles": numbers})
+    assert refused.value.message == f"DAngles has two numbers, not {len(numbers)}."
+    assert teds.decode(teds.compose(3, {**KELVIN, "DAngles": [1, 2]})).get("DAngles") == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(("value", "shown"), [(7, "7"), (None, "None"), ([0], "[0]")])
+def test_a_uuid_is_octets_or_hex_digits(value: object, shown: str) -> None:
+    with pytest.raises(BadDataError) as refused:
+        teds.compose(1, {**META, "UUID": value})
+    assert refused.value.message == f"UUID is octets, not {shown}."
+
+
+@pytest.mark.parametrize(
+    ("extension", "stated"), [("", 0), ("00", 0), ("80", 0), ("05", 5)], ids=["none", "0", "128", "5"]
+)
+def test_units_may_be_given_packed(extension: str, stated: int) -> None:
+    """Interpretation, nine exponents as 128 + twice each, and an extension, which some write as 0x80 for none."""
+    octets = bytes.fromhex("0080807e827c80808080" + extension)
+    written = teds.decode(teds.compose(3, {**KELVIN, "PhyUnits": octets})).get("PhyUnits")
+    assert written == teds.Units(meters=Fraction(-1), kilograms=Fraction(1), seconds=Fraction(-2), extension=stated)
+
+
 @pytest.mark.parametrize(
     "units",
-    [3, "K", {"kelvin": 1}, {"kelvins": "x"}, {"meters": 100}, {"meters": 0.3}, {"interpretation": 300}, b"\0" * 3],
+    [
+        3,
+        "K",
+        {"kelvin": 1},
+        {"kelvins": "x"},
+        {"meters": 100},
+        {"meters": 0.3},
+        {"interpretation": 300},
+        b"\0" * 3,
+        b"\6" + b"\x80" * 9,
+    ],
 )
 def test_units_that_cannot_be_expressed(units: object) -> None:
     with pytest.raises(BadDataError, match="PhyUnits"):

@@ -66,6 +66,14 @@ def test_times_before_1970_and_after_2106() -> None:
     assert [finding.code for finding in to(octets, 2007)[1]] == ["lost"]
 
 
+@pytest.mark.parametrize("edition", [2007, 2024])
+def test_what_follows_the_checksum_of_a_text_based_teds_is_no_text(edition: Any) -> None:
+    octets = teds.compose(11, [("Text", {"Text": "<a/>"}), ("Text", {"LangCode": "de", "Text": "b"})], edition=edition)
+    decoded = teds.decode(octets + b"\xff\xfe\xfd")
+    assert (decoded.text, [finding.code for finding in decoded.findings]) == ((b"<a/>", b"b"), ["frame-trailing"])
+    assert teds.recompose(decoded) == octets
+
+
 def test_nanoseconds_beyond_a_second_are_kept_and_warned_about() -> None:
     block = bytes.fromhex("030400050101" + "0a0a" + "00006955b900" + "b65fffff")
     decoded = teds.decode(frame(block))

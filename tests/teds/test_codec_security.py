@@ -73,6 +73,31 @@ def test_keys_of_other_people_in_every_form(written: bytes, form: str) -> None:
     assert (key.form, key.point) == (form, POINT)
 
 
+@pytest.mark.parametrize(
+    ("octets", "form"),
+    [
+        ("30 00", "der"),
+        ("30 02 0500", "der"),
+        ("30 02 05", "raw"),
+        ("30 01 0500", "raw"),
+        ("31 02 0500", "raw"),
+        ("30", "raw"),
+        ("30 7f" + "00" * 127, "der"),
+        ("30 81 80" + "00" * 128, "der"),
+        ("30 81 81" + "00" * 128, "raw"),
+        ("30 82 0100" + "00" * 256, "der"),
+        ("30 83 000100" + "00" * 256, "der"),
+        ("30 84 00000100" + "00" * 256, "der"),
+        ("30 85 0000000100" + "00" * 256, "raw"),
+        ("30 80" + "00" * 128, "raw"),  # without a length
+        ("30 80", "raw"),
+    ],
+)
+def test_der_is_one_sequence_whose_length_is_that_of_the_rest(octets: str, form: str) -> None:
+    """A short length is one octet below 128; a long one has 1 to 4 octets, whose number the first one says."""
+    assert teds.read_key(bytes.fromhex(octets)).form == form
+
+
 @given(st.binary(max_size=300))
 def test_any_key_is_read(octets: bytes) -> None:
     assert teds.read_key(octets).form in {"pem", "hex", "base64", "der", "raw"}

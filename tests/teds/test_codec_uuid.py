@@ -110,6 +110,20 @@ def test_a_place_on_earth_and_a_moment_of_its_year_are_plausible(changed: dict[s
     assert replace(parts_of("8D4D9DA65281F7000000"), **changed).plausible == plausible
 
 
+@pytest.mark.parametrize(
+    ("year", "time", "moment"),
+    [
+        (0, 0, None),
+        (1, 0, datetime(1, 1, 1)),
+        (2026, 3_153_599, datetime(2026, 12, 31, 23, 59, 50)),
+        (2026, 3_153_600, None),
+        (4095, 1, datetime(4095, 1, 1, 0, 0, 10)),
+    ],
+)
+def test_a_moment_lies_in_its_year_or_is_none(year: int, time: int, moment: datetime | None) -> None:
+    assert replace(parts_of("8D4D9DA65281F7000000"), year=year, time=time).moment == moment
+
+
 def test_the_parts_stand_at_their_bits() -> None:
     """North 1, latitude 20, east 1, longitude 20, manufacturer 4, year 12, time 22, the most significant bit first."""
     widths = {"north": 1, "latitude": 20, "east": 1, "longitude": 20, "manufacturer": 4, "year": 12, "time": 22}

@@ -277,6 +277,48 @@ def test_small_changes_of_a_curve_are_stated_to_the_noise(
     assert change.text.endswith(", stated uncertainty 0.2 N.")
 
 
+def text_based(*texts: tuple[str, object]) -> bytes:
+    return teds.compose(11, [("Text", {"LangCode": language, "Text": text}) for language, text in texts])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ([("en", "<a/>")], [("en", "<b/>")], "node: text <a/> -> <b/>."),
+        ([("en", "<a/>"), ("de", "Öl")], [("en", "<a/>"), ("de", "Eis")], "node: text 2 Öl -> Eis."),
+        ([("en", "<a/>")], [("en", "<a/>"), ("de", "Öl")], "node: text 2 added: Öl."),
+        ([("en", "<a/>"), ("de", "Öl")], [("en", "<a/>")], "node: text 2 removed (was Öl)."),
+        ([("en", b"\xff\x00")], [("en", b"\xfe\x00")], "node: text ff00 -> fe00."),
+        ([("en", b"\xff" * 17)], [("en", b"\xfe" * 17)], "node: text is another."),
+    ],
+)
+def test_texts_are_compared_as_text(old: list[tuple[str, object]], new: list[tuple[str, object]], text: str) -> None:
+    changes = diff_blocks({(0, 11): text_based(*old)}, {(0, 11): text_based(*new)})
+    assert [change.text for change in changes if change.field == "text"] == [text]
+
+
+@pytest.mark.parametrize("side", ["old", "new"])
+def test_readings_beyond_every_number_are_stated_as_such(side: str, finger: Profile) -> None:
+    """Each part of the curve fits a Float32; at raw 65535 the whole is larger than any float."""
+    part = CalibrationInput(1, 70, (0, 65535), (0,))
+    steep = Calibration(1, "polynomial", (part,), (*[0.0] * 70, 3e38), unit=parse_unit("N"))
+    good = finger.build(UUID, calibration={1: line(0, 1e-4)}).blocks
+    bad = finger.build(UUID, calibration={1: steep}).blocks
+    changes = diff_blocks(*((bad, good) if side == "old" else (good, bad)))
+    assert next(change.text for change in changes if change.field == "curve").startswith(
+        "channel 1 (taxel 1): the readings are no numbers, "
+    )
+
+
+def test_fields_of_a_calibration_that_leave_every_reading_as_it_is_are_no_change_of_its_curve(finger: Profile) -> None:
+    """A node of the middle of a straight line may be left out: that is no other calibration."""
+    two = finger.build(UUID, calibration={1: replace(fit([(0, 0), (65535, 10)], "table", channel=1))}).blocks
+    parts = CalibrationInput(1, 1, (0, 65535), (32768,))
+    moved = Calibration(1, "table", (parts,), (10 * 32768 / 65535, 10 / 65535))
+    changes = diff_blocks(two, finger.build(UUID, calibration={1: moved}).blocks)
+    assert texts(changes) == ["channel 1 (taxel 1): calibration: the same content, other octets."]
+
+
 def test_a_calibration_that_cannot_be_computed_is_compared_field_by_field(finger: Profile) -> None:
     good = finger.build(UUID, calibration={1: line(0, 1e-4)}).blocks
     (coefficients,) = [field for field in teds.decode(good[1, 5]).fields if field.name == "Coefs"]

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError, NotFoundError
-from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.formats import FORMATS, TedsBlock, class_of, detect, lost, read_blocks, write_blocks
+from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
+from teds_provision.teds.formats import FORMATS, TedsBlock, class_of, detect, lost, placed, read_blocks, write_blocks
 from teds_provision.teds.formats.intelhex import stretches, write_intel_hex
 from teds_provision.teds.formats.tree import from_tree, shortest, to_tree
 from teds_provision.teds.image import split_run
@@ -89,6 +89,15 @@ def test_a_field_without_a_key_is_named_by_a_profile():
     fields = [("UUID", bytes(10)), ("OholdOff", 1.0), ("TestTime", 0.0), ("MaxChan", 7), ("200", b"own")]
     losses = lost([TedsBlock(0, 1, teds.compose(1, fields)), *others], "toml")
     assert losses == ("MetaTEDS of channel 0: MaxChan, type 200.",)
+
+
+def test_teds_that_no_profile_builds_are_named_with_the_reason():
+    path = PROFILES[0].parent / "load-cell.toml"
+    blocks = [block for block in read_blocks(path.read_bytes(), path=path) if block.access_code != 1]
+    parts = tuples(unframe(teds.compose(1, {"UUID": bytes(10), "OholdOff": 1.0, "TestTime": 0.0, "MaxChan": 1})))
+    short = frame(b"".join(raw_tuple(part.type, part.value[: 9 if part.type == 4 else None]) for part in parts))
+    losses = lost([TedsBlock(0, 1, short), *blocks], "toml")
+    assert losses[0] == "it does not load: A UUID of the 2007 edition has 10 octets, this one 9."
 
 
 def test_teds_without_a_channel_make_no_profile_and_that_is_reported():
@@ -224,6 +233,31 @@ def test_an_image_needs_a_uuid_and_places():
         write_blocks([TedsBlock(None, 12, NAME)], "image")
     with pytest.raises(BadDataError, match="Two TEDS"):
         write_blocks([TedsBlock(0, 1, META), TedsBlock(0, 1, META)], "image")
+
+
+def test_a_document_holds_one_teds_for_each_place():
+    """Those of a channel are of channel 1 if nothing says of which, others of the node; no Security TEDS is taken."""
+    name, calibration = teds.compose(12, {"Format": 0, "TCName": "a"}), teds.compose(5, {"Coefs": [1.0]})
+    security = octets_of(_vector("x24_security"))
+
+    def lines(*blocks):
+        return "\n".join(block.hex() for block in blocks).encode()
+
+    assert placed(lines(name, calibration)) == {(0, 12): name, (1, 5): calibration}
+    for twice, words in (
+        ((name, calibration, name), "12 for channel 0"),
+        ((calibration, calibration), "5 for channel 1"),
+    ):
+        with pytest.raises(BadDataError, match=rf"^It holds two TEDS of access code {words}\.$"):
+            placed(lines(*twice))
+    with pytest.raises(BadDataError, match=r"^There are octets in it that are no TEDS\.$") as refused:
+        placed(lines(bytes(13)))
+    assert refused.value.hint == "See what it holds: teds-provision show FILE"
+    assert placed(lines(name, security)) == {(0, 12): name, (0, 16): security}
+    own = teds.compose(128, {"UsedSecScheme": 4})
+    assert placed(lines(name, own)) == {(0, 12): name}
+    with pytest.raises(BadDataError, match=r"^It holds no TEDS\.$"):
+        placed(lines(own))
 
 
 def test_json_can_be_written_by_hand_without_octets():

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit, read_calibrations
-from teds_provision.teds.codec.frame import frame, unframe
+from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
 from teds_provision.teds.curve import Curve, channel_of
 from teds_provision.teds.guard import GuardFinding, check_calibration
 from teds_provision.teds.image import BlockId
@@ -400,6 +400,23 @@ def test_an_overdue_calibration_is_reported_if_the_time_is_given(tactile: Profil
     assert check_calibration(blocks, None, tactile) == []
     found = check_calibration(blocks, None, tactile, now=datetime(2026, 1, 1, tzinfo=UTC))
     assert codes(found, "warning") == {"overdue"}
+
+
+@pytest.mark.parametrize("kept", ["CalInput", "Coefs", None], ids=str)
+def test_a_calibration_that_the_node_has_and_no_one_understands_is_not_compared(
+    kept: str | None, tactile: Profile
+) -> None:
+    """The new one is judged alone: a slope the other way is no reversal of something unknown."""
+    falling, rising = force_line(10.0, -10 / 65535), force_line()
+    old = built(tactile, rising)
+    numbers = {field.type for field in teds.decode(old[1, 5]).fields if field.name in {"CalInput", "Coefs", kept}}
+    numbers -= {field.type for field in teds.decode(old[1, 5]).fields if field.name == kept}
+    block = b"".join(
+        raw_tuple(part.type, part.value) for part in tuples(unframe(old[1, 5])) if part.type not in numbers
+    )
+    new = built(tactile, falling)
+    assert codes(check_calibration(new, old)) == {"reversed"}
+    assert codes(check_calibration(new, {**old, (1, 5): frame(block)})) == set()
 
 
 def test_a_node_that_was_of_another_type_is_not_compared(tactile: Profile, magnetic: Profile) -> None:

@@ -335,6 +335,22 @@ def test_a_raw_value_beyond_its_bits_is_not_valid_and_beyond_its_points_is_marke
     assert values.extrapolated.tolist() == [True, False, True, True]
 
 
+def test_a_calibration_alone_is_neither_wrapped_nor_limited_and_only_a_sensors() -> None:
+    part = CalibrationInput(1, 1, (0.0, 1000.0), (0.0,))
+    line = Calibration(1, "linear", (part,), (0.0, 1.0), unit=parse_unit("degree"))
+    sheet = changed(sheet_of("magnetic-angular-position-sensor", {1: line}), sample=SampleForm(0, 2, 12))
+    value, possible, outside = ChannelInterpreter(sheet, 1).calibrated(np.array([10, 1001, 5000], dtype=np.uint64))
+    assert value.tolist() == [10.0, 1001.0, 5000.0]
+    assert (possible.tolist(), outside.tolist()) == ([True, True, False], [False, True, True])
+    raws = np.array([1], dtype=np.uint64)
+    # a profile is not asked for: floats speak for themselves, and have no calibration
+    floats = ChannelInterpreter(changed(sheet_of("magnetic-angular-position-sensor"), sample=SampleForm(1, 4)), 1)
+    for interpreter in (floats, ChannelInterpreter(actuator(), 1)):
+        assert interpreter.problem == ""
+        with pytest.raises(BadDataError, match=r"^Channel 1 has no calibration of a sensor\.$"):
+            interpreter.calibrated(raws)
+
+
 def test_a_channel_without_calibration_gives_raw_values_alone_and_says_why() -> None:
     interpreter = ChannelInterpreter(sheet_of("magnetic-angular-position-sensor"), 1)
     assert "no calibration" in interpreter.problem

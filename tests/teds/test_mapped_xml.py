@@ -112,6 +112,7 @@ high-limit = "9 kN"
             "'force' at 'n' is not a number",
         ),
         (XML, 'channel = "c"\n[channel-keys]\nnumber = "n"\n', "'force' is no channel number"),
+        *((XML, f'channel = "c"\n{key} = 3\n', f"{key} is not a table") for key in ("keys", "channel-keys", "values")),
         (XML, 'channel = "c["\n', "is no path"),
         (XML, 'channel = "c"\n[channel-keys]\nname = 3\n', "name is no place"),
         (b"<d>" + b"<c/>" * 256 + b"</d>", 'channel = "c"\n', "at most 255"),

@@ -240,6 +240,29 @@ def test_a_curve_over_the_end_of_a_turn_has_a_gap_there() -> None:
     assert float(np.nanmax(np.abs(np.diff(kept)))) > 300
 
 
+def test_a_picture_goes_as_far_as_the_calibration_says_that_raw_values_go(finger) -> None:  # type: ignore[no-untyped-def]
+    """Read from a node, whose TEDS carries the range; a profile that is given has its own."""
+    made = read_calibrations("# channel: 1\n0,0\n4095,10\n", "x.csv", finger)
+    made[1] = replace(made[1], raw_range=(0.0, 4095.0))
+    blocks = finger.build(UUID, calibration=made).blocks
+    for profile, end in ((None, 4095), (finger, 65535)):
+        (panel,) = plot._panels(blocks, None, profile, {})
+        assert panel.curve.axes[0][-1] == end
+
+
+def test_points_and_nodes_lie_above_the_curve_and_a_range_without_samples_has_no_bend(finger) -> None:  # type: ignore[no-untyped-def]
+    made = read_calibrations("# channel: 1\n# method: table\n0,0\n30000,4\n65535,10\n", "x.csv", finger)
+    blocks = finger.build(UUID, calibration=made).blocks
+    for given in (None, made):
+        upper, _ = drawn(blocks, given)
+        heights = {how["label"]: how["zorder"] for name, _, how in upper.drawn if name == "plot" and how["label"]}
+        above = heights.pop("3 nodes" if given is None else "3 points")
+        assert above > max(heights.values())
+    between = replace(made[1], inputs=(CalibrationInput(1, 1, (10.25, 10.5, 10.75), (10.25, 10.5)),))
+    _, lower = drawn(finger.build(UUID, calibration={1: between}).blocks)
+    assert lower.all("plot") == lower.all("set_title") == []
+
+
 def test_25_channels_do_not_fit_one_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plot, "_panels", lambda *_: [None] * 25)
     with pytest.raises(UsageError, match="25 channels do not fit one picture") as refused:

@@ -149,6 +149,25 @@ def test_segments_have_no_points() -> None:
         fit_points("from,to,offset,c0,c1\n0,10,0,1,2\n", "x.csv")
 
 
+@pytest.mark.parametrize(
+    ("remarks", "spread", "count"),
+    [
+        ("", None, None),
+        (", 0.5", 0.5, None),
+        (", 0.5, 32", 0.5, 32),
+        (", me, 32", None, 32),
+        (", inf, nan", None, None),
+        (", 0.5, 32, x", 0.5, 32),
+    ],
+)
+def test_spread_and_count_of_a_point_are_given_if_they_are_numbers(
+    remarks: str, spread: float | None, count: int | None
+) -> None:
+    columns = ", #" * remarks.count(",")
+    (point,) = points_of(f"channel, raw, value [degree]{columns}\n2, 7, 90{remarks}\n", "x.csv")
+    assert point == {"channel": 2, "raw": 7.0, "value": 90.0, "spread": spread, "count": count}
+
+
 def test_remarks_are_no_values(tmp_path: Path) -> None:
     text = "raw, # who, value [N], #\n0, me, 1\n5, you, 2, x\n"
     assert fit_points(text, "x.csv")[1].points == ((0, 1), (5, 2))

@@ -439,6 +439,105 @@ def test_all_mistakes_are_found_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("links = 3", 'links: a list of texts is expected, like ["nfc", "can"], not 3.'),
+        ("links = 'nfc'", """links: a list of texts is expected, like ["nfc", "can"], not 'nfc'."""),
+        ("links = ['nfc', 3]", """links: a list of texts is expected, like ["nfc", "can"], not ['nfc', 3]."""),
+        ("links = [{ a = 1 }]", 'links: a list of texts is expected, like ["nfc", "can"], not a list of tables [[…]].'),
+        ("phy = 3", "phy: a table [phy] is expected, not 3."),
+        ("firmware = []", "firmware: a table [firmware] is expected, not []."),
+        ("title = { a = 1 }", "title: a value is expected here, not a table."),
+        ("text = 3", "text: tables [[text]] are expected."),
+        ("text = [1]", "text: tables [[text]] are expected."),
+        ("text = { a = 1 }", "text: tables [[text]] are expected."),
+        ("abstract = 1", "abstract: true or false is expected, not 1."),
+    ],
+)
+def test_a_value_of_another_kind_is_named_with_what_is_expected(line: str, message: str, tmp_path: Path) -> None:
+    text = GOOD if not line.startswith("title") else GOOD.partition("\n")[2]
+    _, problems = check(write(tmp_path, "force", f"{line}\n{text}"))
+    assert [str(problem).partition(": ")[2] for problem in problems if problem.severity == "error"] == [message]
+
+
+def test_an_empty_list_of_tables_is_none(tmp_path: Path) -> None:
+    profile = load_profile(write(tmp_path, "force", f"text = []\n{GOOD}"))
+    assert profile.texts == ()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("multi-range = 1", "channel.1.multi-range: true or false is expected, not 1."),
+        ("self-test = 'yes'", "channel.1.self-test: true or false is expected, not 'yes'."),
+        ('direction = "3 mm"', 'channel.1.direction: "3 mm" is not an angle.'),
+        ('direction = "x degree"', "channel.1.direction: a number and a unit are expected"),
+        ("direction = true", "channel.1.direction: a number is expected, not True."),
+    ],
+)
+def test_a_flag_and_an_angle_are_of_their_kind(line: str, message: str, tmp_path: Path) -> None:
+    _, problems = check(write(tmp_path, "force", f"{GOOD}{line}\n"))
+    errors = [str(problem).partition(": ")[2] for problem in problems if problem.severity == "error"]
+    assert len(errors) == 1
+    assert errors[0].startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("line", "radians"),
+    [
+        ('direction = "180 degree"', math.pi),
+        ('direction = "2"', 2.0),
+        ("direction = 3", 3.0),
+        ('direction = "1 rad"', 1.0),
+    ],
+)
+def test_an_angle_without_a_unit_is_in_radians(line: str, radians: float, tmp_path: Path) -> None:
+    profile = load_profile(write(tmp_path, "force", f"{GOOD}{line}\n"))
+    assert profile.channels[0].fields["Directon"] == pytest.approx(radians)
+
+
+@pytest.mark.parametrize("extends", ["3", '["a"]', "{ a = 1 }", "true"])
+def test_a_profile_extends_one_by_its_name(extends: str, tmp_path: Path) -> None:
+    path = write(tmp_path, "force", f"extends = {extends}\n{GOOD}")
+    with pytest.raises(BadDataError) as refused:
+        load_profile(path)
+    assert refused.value.message == (
+        f'{path}:1: extends: the name of one profile is expected, like extends = "smart-sensor".'
+    )
+
+
+def test_at_most_sixteen_profiles_extend_each_other(tmp_path: Path) -> None:
+    write(tmp_path, "p0", GOOD)
+    for number in range(1, 18):
+        write(tmp_path, f"p{number}", f'extends = "p{number - 1}"\n')
+    assert len(load_profile("p16", [tmp_path]).lineage) == 17, "itself, and sixteen above it"
+    with pytest.raises(BadDataError) as refused:
+        load_profile("p17", [tmp_path])
+    assert refused.value.message.endswith("p1.toml:1: extends: more than 16 profiles extend each other.")
+
+
+def test_a_file_that_cannot_be_read_is_among_the_known_ones_and_a_base_is_not(tmp_path: Path) -> None:
+    """Its name may be what was meant: the message about its content comes when it is asked for."""
+    (tmp_path / "damaged.toml").write_bytes(b"abstract = true # \xff\n")
+    write(tmp_path, "base", f"abstract = true\n{GOOD}")
+    write(tmp_path, "near", f"# abstract = true\n{GOOD}")
+    with pytest.raises(NotFoundError) as refused:
+        load_profile("qqqq", [tmp_path])
+    assert refused.value.hint.startswith("Known are: damaged, near. ")
+
+
+def test_a_calibration_that_the_key_denies_is_a_warning(tmp_path: Path) -> None:
+    curve = fit([(0, 0.0), (4095, 10.0)], "linear", channel=1)
+    dated = replace(curve, unit=parse_unit("N"), date=datetime.now(UTC))
+    for key, warnings in (
+        ("none", ("Channel 1 (force) has a calibration, but its calibration key says that there is none.",)),
+        ("auto", ()),
+    ):
+        profile = load_profile(write(tmp_path, key, f'{GOOD}calibration-key = "{key}"\n'))
+        assert profile.build(UUID, calibration={1: dated}).warnings == warnings
+
+
+@pytest.mark.parametrize(
     ("octets", "words"), [(b"a = \n", ":1: "), (b"\n\xff\n", ":2: the text is not UTF-8"), (b"x" * (1 << 21), "octets")]
 )
 def test_what_is_not_toml_is_bad_data(octets: bytes, words: str, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from fractions import Fraction
@@ -131,6 +132,40 @@ def test_products_of_the_table_agree_with_pint(form: str) -> None:
 def test_products_need_no_pint(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setattr(u, "_registry", lambda: None)
     assert u.parse_unit(text).units.interpretation == u.PRODUCT
+
+
+@pytest.mark.parametrize("text", ["dB/m", "m*dB", "bit/s", "ratio*m", "strain/s", "N/percent"])
+def test_what_is_no_product_of_si_units_is_no_factor(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    """A ratio, a level or a number of bits in a product would leave its kind out."""
+    u.parse_unit.cache_clear()
+    monkeypatch.setattr(u, "_registry", lambda: None)
+    with pytest.raises(
+        BadDataError, match=f'^"{re.escape(text)}" is not a unit that is known without the package pint'
+    ):
+        u.parse_unit(text)
+    u.parse_unit.cache_clear()
+
+
+def test_a_unit_of_a_kind_that_the_si_has_not_is_named() -> None:
+    with pytest.raises(BadDataError) as refused:
+        u.parse_unit("pixel/s")
+    assert refused.value.message == 'The unit "pixel/s" holds pixel, which the SI units of a TEDS cannot say.'
+    assert refused.value.hint == ('Use "arbitrary" for what has no SI unit, "count" for a number, "digital" for bits.')
+
+
+def test_a_symbol_is_only_suggested_with_a_power_that_a_teds_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(u, "_registry", lambda: None)
+    for text, hint in (("newtons^32", 'Did you mean "N^32"? Write it'), ("newtons^99", "Write it")):
+        u.parse_unit.cache_clear()
+        with pytest.raises(BadDataError) as refused:
+            u.parse_unit(text)
+        assert refused.value.hint.startswith(hint)
+    u.parse_unit.cache_clear()
+
+
+def test_without_the_package_pint_its_units_are_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pint", None)
+    assert u._registry.__wrapped__() is None, "past its cache: to load pint again would take a second"
 
 
 def test_a_rare_unit_without_pint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

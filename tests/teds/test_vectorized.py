@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from weakref import WeakValueDictionary
 
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from teds_provision.arrays import without_repeats
 from teds_provision.teds import Sheet
-from teds_provision.teds.calibration import ChannelInterpreter, fit, vectorized
+from teds_provision.teds.calibration import Calibration, CalibrationInput, ChannelInterpreter, fit, vectorized
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.units import parse_unit
@@ -121,6 +122,39 @@ def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], 
         usable = last or column < 3
         np.testing.assert_array_equal(valid[:, column], alone.valid & usable)
         np.testing.assert_array_equal(value[:, column], interpreter.unit.to_si(alone.value) if usable else np.nan)
+
+
+def test_samples_of_three_octets_are_read_side_by_side_too() -> None:
+    known = sheet()
+    wide = tuple(replace(channel, sample=SampleForm(0, 3), high=1e9) for channel in known.channels[:2])
+    channels = [ChannelInterpreter(replace(known, channels=wide), number) for number in (1, 2)]
+    many = ManyChannels.side_by_side(channels, [True, True])
+    assert many is not None
+    octets = bytes.fromhex("000001 00ffff 123456 800000")
+    raw = many.raw(octets)
+    assert raw.tolist() == [[1, 0xFFFF], [0x123456, 0x800000]]
+    assert raw.dtype == np.int64
+    value, valid = many.values(raw)
+    for column, interpreter in enumerate(channels):
+        rows = np.frombuffer(octets, np.uint8).reshape(2, 6)[:, 3 * column : 3 * column + 3]
+        alone = interpreter.values(interpreter.reader.raw(rows))
+        np.testing.assert_array_equal(valid[:, column], alone.valid)
+        np.testing.assert_array_equal(value[:, column], interpreter.unit.to_si(alone.value))
+
+
+def test_a_curve_that_overflows_gives_no_value_and_no_warning() -> None:
+    """A polynomial of degree 70 grows beyond the largest float where each part of it fits a Float32."""
+    part = CalibrationInput(1, 70, (0.0, 65535.0), (0.0,))
+    steep = Calibration(1, "polynomial", (part,), (*[0.0] * 70, 3e38))
+    known = sheet()
+    first = replace(known.channels[0], calibration=steep, low=-math.inf, high=math.inf)
+    interpreter = ChannelInterpreter(replace(known, channels=(first,)), 1)
+    many = ManyChannels.side_by_side([interpreter], [True])
+    assert many is not None
+    with np.errstate(over="raise", invalid="raise"):
+        value, valid = many.values(many.raw(bytes.fromhex("0000 0001 ffff")))
+    assert valid[:, 0].tolist() == [True, True, False]
+    assert value[:2, 0].tolist() == [0.0, pytest.approx(3e38)]
 
 
 def test_tables_are_shared_by_channels_of_one_curve_and_are_few(monkeypatch: pytest.MonkeyPatch) -> None:

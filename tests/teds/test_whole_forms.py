@@ -325,6 +325,8 @@ def one(**field: object) -> str:
         (one(type=256), "The type of a field of TEDS 1 is not a number from 0 to 255."),
         (one(type=7, fields=1), '"fields" of TEDS 1, type 7 is not a list.'),
         (one(name="x", kind="number", value="1"), "TEDS 1, x holds '1' where a number is asked."),
+        (one(name="x", kind="number", value=10**400), "TEDS 1, x holds a number that is too large."),
+        (one(name="x", kind="numbers", value=[1, 10**400]), "TEDS 1, x holds a number that is too large."),
         (one(name="x", kind="number", value=True), "TEDS 1, x holds True where a number is asked."),
         (one(name="x", kind="integer", value=True), "The value of TEDS 1, x is no integer: 'True'."),
         (one(name="x", kind="integers", value=[1, True]), "The value of TEDS 1, x is no integers: '[1, True]'."),
@@ -365,6 +367,13 @@ def around(inside: str) -> str:
         (around("<teds><octets>0g</octets></teds>"), "The octets of TEDS 1 are not hex digits."),
         (around("<teds><number>1</number></teds>"), "TEDS 1 holds 'number' where field is asked, or nests too deep."),
         (around("<teds><field a='1'/></teds>"), "TEDS 1 has no attribute 'a'."),
+        *(
+            (
+                around(f"<teds><field name='x' type='7'><{kind}><a/></{kind}></field></teds>"),
+                f"The {kind} of TEDS 1, x holds further elements.",
+            )
+            for kind in ("units", "number", "time")
+        ),
         ("<a><b></a>", "This is not XML: "),
         ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "The XML holds a DTD or an entity, which is refused."),
     ],

@@ -460,10 +460,14 @@ def _from_table(table: TomlTable, file: str) -> list[CalibrationOrder]:
 def _order(table: TomlTable, file: str) -> CalibrationOrder:
     order = CalibrationOrder(file, table.where.line)
     for key, entry in table.entries.items():
-        if key not in KEYS or key == "calibration" or isinstance(entry, TomlTable):
+        if key not in KEYS:
             near = get_close_matches(key[:64], KEYS, n=1)
             guess = f' Did you mean "{near[0]}"?' if near else f" Known are: {', '.join(KEYS)}."
             raise BadDataError(f"{entry.where}: {key}: there is no such key.{guess}")
+        if key == "calibration":
+            raise BadDataError(f"{entry.where}: {key}: tables [[calibration]] are expected.")
+        if isinstance(entry, TomlTable):
+            raise BadDataError(f"{entry.where}: {key}: a value is expected here, not a table.")
         order.values[key] = (entry.value, entry.where.line)
     return order
 

@@ -51,7 +51,7 @@ def _values(fields: Iterable[Field], spec_of: Callable[[int], FieldSpec | None],
         value = field.value
         if field.children:
             if value.__class__ is Units:  # spelled as tuples: its interpretation is one of them
-                _exponents(field, find)
+                _exponents(field, None, find)
             spec = spec_of(field.type) or table.inner.get(field.type)
             if spec is not None:
                 _values(field.children, spec.by_type.get, table, find)
@@ -103,17 +103,7 @@ def _integer(field: Field, spec: FieldSpec | None, find: Find) -> None:
         find(severity, "enumeration", message, field.offset, field.name, known, field.value)
 
 
-def _interpretation(field: Field, _spec: FieldSpec | None, find: Find) -> None:
-    units = field.value
-    if not isinstance(units, Units):
-        return
-    if units.interpretation > 5:
-        message = f"{field.name} has interpretation {units.interpretation}; 0 to 5 are known."
-        find("error", "enumeration", message, field.offset, field.name, "0 to 5", units.interpretation)
-    _exponents(field, find)
-
-
-def _exponents(field: Field, find: Find) -> None:
+def _exponents(field: Field, _spec: FieldSpec | None, find: Find) -> None:
     units = field.value
     if not isinstance(units, Units):
         return
@@ -138,7 +128,7 @@ def _text(field: Field, spec: FieldSpec | None, find: Find) -> None:
 
 
 _LOOK: Final[dict[type, Callable[[Field, FieldSpec | None, Find], None]]] = {
-    Units: _interpretation,
+    Units: _exponents,
     TimeInstance: _time,
     str: _text,
     bytes: _text,

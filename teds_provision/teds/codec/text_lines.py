@@ -21,7 +21,7 @@ MOST_OCTETS: Final = 255
 def compose_lines(access_code: int, values: Mapping[str, str]) -> bytes:
     """Return the framed TEDS with a line for each value, in their order; raises BadDataError if one cannot be held."""
     for key, value in values.items():
-        if not _is_line(value):
+        if not value.isprintable():
             raise BadDataError(
                 f"{key} cannot stand in a TEDS of lines: {value[:40]!r} is not one line of printable text."
             )
@@ -60,7 +60,7 @@ def values_of(access_code: int, text: str, *orders: Sequence[str]) -> dict[str, 
         raise BadDataError(
             f"The lines of the TEDS of access code {access_code} are not {', '.join(orders[0])}, in this order."
         )
-    if not all(_is_line(value) for _, _, value in pairs):
+    if not all(value.isprintable() for _, _, value in pairs):
         raise BadDataError(f"A line of the TEDS of access code {access_code} is not printable text.")
     return {key: value for key, _, value in pairs}
 
@@ -68,15 +68,3 @@ def values_of(access_code: int, text: str, *orders: Sequence[str]) -> dict[str, 
 def _tedsid(access_code: int) -> bytes:
     """Return the TEDSID's value: family 0, this class, version 1, tuples with one length octet."""
     return bytes([0, access_code, 1, 1])
-
-
-def _is_line(value: str) -> bool:
-    return value.isprintable() and _encodable(value)
-
-
-def _encodable(value: str) -> bool:
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True

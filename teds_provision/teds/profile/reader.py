@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -161,16 +161,6 @@ def parse(text: str, file: str) -> TomlTable:
 def read_text(path: Path) -> str:
     """Read a small UTF-8 file; raises NotFoundError, BadDataError or StoreError naming it."""
     return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreError)
-
-
-def walk(table: TomlTable) -> Iterator[tuple[str, PlacedValue]]:
-    """Yield every value of a table with its dotted path."""
-    for key, entry in table.entries.items():
-        path = f"{table.path}.{key}" if table.path else key
-        if isinstance(entry, TomlTable):
-            yield from walk(entry)
-        else:
-            yield path, entry
 
 
 _LIMITS = {KeyKind.U8: 0xFF, KeyKind.U16: 0xFFFF, KeyKind.U32: 0xFFFF_FFFF}
