@@ -124,7 +124,7 @@ class JsonLines(Recording):
             raise self._bad("the values in or above the line are not those of a recording") from None
         if time.ndim != 1 or not value.shape == raw.shape == (len(time), len(lines)) or len(uuid) > MOST.text:
             raise self._bad("the lists in or above the line are not of one length")
-        channels = tuple(channel_number(line["channel"], f"{self.path}:{self._line}") for line in lines)
+        channels = tuple(channel_number(line.get("channel"), f"{self.path}:{self._line}") for line in lines)
         streams = numbers.setdefault(uuid, {})
         stream = streams.setdefault(channels, len(streams))
         valid = np.isfinite(value)

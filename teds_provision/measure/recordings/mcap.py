@@ -23,7 +23,15 @@ from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, ChannelFacts, Note
 from teds_provision.measure.recordings.columns import BlockJoiner, raw_kind
 from teds_provision.measure.recordings.json_lines import report_of
-from teds_provision.measure.recordings.source import MOST, Entry, Recording, facts_of, station_of, unix_of
+from teds_provision.measure.recordings.source import (
+    MOST,
+    TEXT_FACTS,
+    Entry,
+    Recording,
+    facts_of,
+    station_of,
+    unix_of,
+)
 from teds_provision.measure.sinks.mcap.recording import LITTLE_ENDIAN, TYPE, layout
 from teds_provision.measure.sinks.mcap.recover import unpacked
 from teds_provision.measure.sinks.mcap.writer import (
@@ -245,11 +253,8 @@ class McapRecording(Recording):
 
 
 def _ends(file: BinaryIO) -> bool:
-    """Return True if the file has the mark of an end."""
-    size = file.seek(0, 2)
-    if size < 2 * len(MAGIC):
-        return False
-    file.seek(size - len(MAGIC))
+    """Return True if the file has the mark of an end; it is longer than that mark."""
+    file.seek(-len(MAGIC), 2)
     return file.read() == MAGIC
 
 
@@ -279,26 +284,8 @@ def _values(words: dict[str, str]) -> dict[str, Any]:
             value = json.loads(text)
         except (ValueError, RecursionError):
             value = text
-        found[name] = value if not isinstance(value, str) and name not in _TEXTS else text
+        found[name] = value if not isinstance(value, str) and name not in TEXT_FACTS and name != "kind" else text
     return found
-
-
-_TEXTS: Final = frozenset(
-    {
-        "uuid",
-        "node",
-        "name",
-        "unit",
-        "shown_unit",
-        "fingerprint",
-        "sample_form",
-        "quantity",
-        "frame",
-        "kind",
-        "calibrated",
-        "due",
-    }
-)
 
 
 def _reported(topic: _Topic, content: bytes) -> Entry | None:

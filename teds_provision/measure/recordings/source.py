@@ -41,6 +41,8 @@ class ReadLimits:
 MOST: Final = ReadLimits()
 ROWS: Final = 4096
 """Rows that are handed on together: enough for numpy, few enough to keep nodes together in time."""
+_LATEST: Final = 1.8e10  # unix seconds; nanoseconds in 64 bits, as MCAP has them, reach to 2554
+_HIGHEST: Final = 2**63  # sample numbers are int64 in Parquet
 
 
 Entry = Block | GroupRows | NodeReport | Note | tuple[ChannelFacts, ...]
@@ -74,7 +76,21 @@ class Recording(ABC):
 
         Raises BadDataError, NotFoundError.
         """
-        return map(self._to_si.convert, self._stored_entries())
+        return map(self._to_si.convert, map(self._checked, self._stored_entries()))
+
+    def _checked(self, entry: Entry) -> Entry:
+        """Return an entry that any format can hold; raises BadDataError for numbers that no recorder writes."""
+        if not isinstance(entry, Block | GroupRows):
+            return entry
+        where = f"{self.path}: node {entry.uuid}" if isinstance(entry, Block) else f"{self.path}: group {entry.group}"
+        if not ((entry.time >= 0) & (entry.time <= _LATEST)).all():
+            raise BadDataError(f"{where} has a time that is not in the years 1970 to 2540.")
+        if isinstance(entry, Block):
+            if not 0 <= entry.index < _HIGHEST - len(entry.time):
+                raise BadDataError(f"{where} has a sample number that is negative or too large.")
+            if entry.clock_error is not None and not math.isfinite(entry.clock_error):
+                raise BadDataError(f"{where} has a clock error that is not finite.")
+        return entry
 
     @abstractmethod
     def _stored_entries(self) -> Iterator[Entry]:
@@ -147,10 +163,11 @@ def unix_of(text: object) -> float:
         return 0.0
 
 
-_TEXTS = frozenset(
+TEXT_FACTS: Final = frozenset(
     {"uuid", "node", "name", "unit", "shown_unit", "calibrated", "due", "fingerprint", "sample_form", "quantity"}
-    | {"frame", "si_unit"}
+    | {"frame", "si_unit", "wrapped"}
 )
+"""Fields of :class:`ChannelFacts` that are texts."""
 _NUMBERS = frozenset({"low", "high", "uncertainty", "period", "deviation", "own_period", "si_factor", "si_offset"})
 _FLAGS = frozenset({"overdue", "unsigned", "unverified"})
 _FIELDS = frozenset(field.name for field in fields(ChannelFacts))
@@ -183,7 +200,7 @@ def facts_of(words: object, where: str) -> ChannelFacts:
 
 def _fact(name: str, value: Any, where: str) -> Any:
     """Return one fact as :class:`ChannelFacts` has it; raises BadDataError if the value is of the wrong kind."""
-    if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
+    if name in TEXT_FACTS and isinstance(value, str) and len(value) <= MOST.text:
         return value
     if name in _NUMBERS and (number := number_of(value)) is not None:
         return _finite(number, name, where)

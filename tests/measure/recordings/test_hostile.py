@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import subprocess
 import sys
@@ -117,6 +118,37 @@ def test_a_chunk_that_unpacks_to_gigabytes_is_refused_unopened(tmp_path: Path) -
         )
         done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
         assert "damaged" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"time": [-1, 2]}, "has a time that is not in the years 1970 to 2540."),
+        ({"time": [1, None]}, "has a time that is not in the years 1970 to 2540."),
+        ({"time": [1, 1.9e10]}, "has a time that is not in the years 1970 to 2540."),
+        ({"time": [1, float("inf")]}, "has a time that is not in the years 1970 to 2540."),
+        ({"index": -1}, "has a sample number that is negative or too large."),
+        ({"index": 2**63 - 2}, "has a sample number that is negative or too large."),
+        ({"clock_error": float("inf")}, "has a clock error that is not finite."),
+    ],
+)
+def test_numbers_that_no_recorder_writes_are_refused_in_every_format_that_they_could_go_to(
+    tmp_path: Path, change: dict[str, object], why: str
+) -> None:
+    """Python's own errors came of them when they were converted."""
+    words = {"event": "data", "uuid": "ab", "channel": 1, "index": 0, "time": [1, 2], "raw": [1, 2], "value": [1, 2]}
+    path = tmp_path / "run.jsonl"
+    for changes in (change, {"index": 2**63 - 3}, {"time": [0, 1.7e10]}, {"clock_error": 0.0}):
+        path.write_text('{"event":"note","why":"x"}\n' + json.dumps(words | changes) + "\n")
+        if changes is change:
+            refused(path, f"{path}: node ab {why}")
+        else:
+            read(path)
+    if "time" in change:
+        cells = ["" if time is None else str(time) for time in change["time"]]  # type: ignore[attr-defined]
+        wide = tmp_path / "run.csv"
+        wide.write_text("# teds-provision measurement, text 1, wide; times\ntime\n" + "\n".join([*cells, ""]))
+        refused(wide, f"{wide}: group all {why}")
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

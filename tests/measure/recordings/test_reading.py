@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.measure.blocks import Block, GroupRows, InvalidValues, NodeReport, Note
 from teds_provision.measure.recordings import json_lines, parquet, source, text
 from teds_provision.measure.recordings.converting import convert
@@ -322,3 +323,239 @@ def test_a_raw_value_survives_each_conversion_to_the_last_bit(
     convert(tmp_path / "origin.jsonl", target)
     found = [entry for entry in open_recording(target).entries() if isinstance(entry, Block)]
     assert [raw for entry in found for raw in entry.raw[:, 0].tolist()] == raws
+
+
+DAMAGED = "the values in or above the line are not those of a recording."
+LENGTHS = "the lists in or above the line are not of one length."
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"uuid": ...}, DAMAGED),
+        ({"index": ...}, DAMAGED),
+        ({"index": "x"}, DAMAGED),
+        ({"index": None}, DAMAGED),
+        ({"index": float("inf")}, DAMAGED),
+        ({"time": ...}, DAMAGED),
+        ({"time": ["x"]}, DAMAGED),
+        ({"raw": ...}, DAMAGED),
+        ({"raw": ["0g"]}, DAMAGED),
+        ({"raw": 5}, DAMAGED),
+        ({"value": ["x"]}, DAMAGED),
+        ({"clock_error": "x"}, DAMAGED),
+        ({"time": 1}, LENGTHS),
+        ({"time": [[1]]}, LENGTHS),
+        ({"time": [1, 2]}, LENGTHS),
+        ({"raw": [1, 2]}, LENGTHS),
+        ({"value": [1, 2]}, LENGTHS),
+        ({"uuid": "x" * 1001}, LENGTHS),
+        ({"channel": -1}, "-1 is no number of a channel."),
+        ({"channel": ...}, "None is no number of a channel."),
+    ],
+)
+def test_a_line_of_json_that_is_no_samples_is_named(tmp_path: Path, change: dict[str, Any], why: str) -> None:
+    """Written with spaces, as by another program: a line without its channel ended in an error of Python."""
+    words = {"event": "data", "uuid": "a", "channel": 1, "index": 0, "time": [1], "raw": [1], "value": [1], **change}
+    path = tmp_path / "run.jsonl"
+    with pytest.raises(BadDataError) as refused:
+        read(path, '{"event":"note","why":"x"}\n' + json.dumps({k: v for k, v in words.items() if v is not ...}) + "\n")
+    assert refused.value.message == f"{path}:2: {why}"
+    if why in (DAMAGED, LENGTHS):
+        assert refused.value.hint == "It was changed after it was recorded, or is damaged."
+
+
+@pytest.mark.parametrize(("line", "why"), [("[1]", "the line is not a JSON object."), ("{", "the line is not JSON.")])
+def test_a_line_that_is_no_object_is_named(tmp_path: Path, line: str, why: str) -> None:
+    with pytest.raises(BadDataError) as refused:
+        read(tmp_path / "run.jsonl", f'{{"event":"note","why":"x"}}\n{line}\n')
+    assert refused.value.message == f"{tmp_path / 'run.jsonl'}:2: {why}"
+
+
+def test_lines_of_json_that_no_reader_knows_are_passed_over(tmp_path: Path) -> None:
+    lines = (
+        '{"event":"recording","station":"bench","clock":"GPS"}\n'
+        '{"event":"later","uuid":"a"}\n'
+        '{"kind":"data"}\n'
+        f'{{"event":"note","time":2,"why":"{"x" * 1001}"}}\n'
+        '{"event":"data","uuid":"a","index":3,"time":[1.5],"raw":[7],"value":[0.5],"channel":1,"clock_error":0.5,'
+        '"test_pattern":true}\n'
+        '{"event":"data","uuid":"a","index":4,"time":[2.5],"raw":[8],"value":[null],"channel":1,"test_pattern":1}\n'
+    )
+    note, first, second = (entry for entry in read(tmp_path / "run.jsonl", lines) if entry)
+    assert note == Note(2.0, "x" * 1000)
+    assert told(first) == ("a", 0, (1,), 3, [1.5], [[7]], 0.5)
+    assert told(second) == ("a", 0, (1,), 4, [2.5], [[8]], None)
+    assert (first.test_pattern, second.test_pattern) == (True, False)
+    assert (first.valid.tolist(), second.valid.tolist()) == ([[True]], [[False]])
+    assert first.tick.tolist() == [0]
+    assert open_recording(tmp_path / "run.jsonl").station.name == "bench"
+
+
+def test_the_first_line_of_values_gives_the_facts_that_no_head_gave(tmp_path: Path) -> None:
+    """As ``measure --json`` printed them."""
+    line = (
+        '{"event":"data","uuid":"ab","channel":3,"name":"force","unit":"N","index":0,"time":[1],"raw":[1],"value":[1],'
+        '"uncertainty":0.5,"unsigned":true,"unverified":true}\n'
+    )
+    path = tmp_path / "run.jsonl"
+    path.write_text(line + line.replace("force", "later") + line.replace('"uncertainty":0.5', '"uncertainty":null'))
+    (facts,) = open_recording(path).facts.values()
+    assert (facts.key, facts.name, facts.unit, facts.uncertainty) == (("ab", 3), "force", "N", 0.5)
+    assert (facts.unsigned, facts.unverified) == (True, True)
+
+
+@pytest.mark.parametrize(
+    ("form", "cells", "raws"),
+    [
+        ("", ["00ff", "", "ab"], ["00ff", "", "ab"]),
+        ("", ["0.5", "", "7"], [0.5, "nan", 7.0]),
+        ("", ["12", "-3", "18446744073709551616"], [12, -3, 2**64]),
+        ("Float32, 4 octets", ["12", "3", "4"], [12.0, 3.0, 4.0]),
+        ("unsigned integer, 2 octets", ["12", "3", "4"], [12, 3, 4]),
+    ],
+)
+def test_a_raw_value_of_text_is_read_by_its_form_else_by_how_it_looks(
+    tmp_path: Path, form: str, cells: list[str], raws: list[Any]
+) -> None:
+    head = f'{text.FIRST}; times\n# channel: {{"uuid": "{A}", "number": 1, "sample_form": "{form}"}}\n'
+    rows = "".join(f"{row},{A},{row},,,,{cell}\n" for row, cell in enumerate(cells))
+    found = [entry for entry in read(tmp_path / "run.csv", f"{head}time,uuid,index,clock_error,note,a,a raw\n{rows}")
+             if isinstance(entry, Block)]  # fmt: skip
+    shown = {
+        int(row): value for entry in found for row, value in zip(entry.time, entry.raw[:, 0].tolist(), strict=True)
+    }
+    expected = {row: bytes.fromhex(raw) if isinstance(raw, str) else raw for row, raw in enumerate(raws) if cells[row]}
+    assert shown == expected
+    assert [type(value) for value in shown.values()] == [type(value) for value in expected.values()]
+
+
+@pytest.mark.parametrize("cells", [["0g"], ["abc"], ["zz", "00"], ["1 2 x"]])
+def test_a_raw_value_of_text_that_is_neither_number_nor_octets_is_refused(tmp_path: Path, cells: list[str]) -> None:
+    head = f'{text.FIRST}; times\n# channel: {{"uuid": "{A}", "number": 1}}\n'
+    rows = "".join(f"{row},{A},{row},,,,{cell}\n" for row, cell in enumerate(cells))
+    with pytest.raises(
+        BadDataError, match=rf":4: one of the {len(cells)} rows from here on has a cell that is no number"
+    ):
+        read(tmp_path / "run.csv", f"{head}time,uuid,index,clock_error,note,a,a raw\n{rows}")
+
+
+@pytest.mark.parametrize("line", ["time,a\rb", "time," + "x" * 131_073])
+def test_names_of_columns_that_no_csv_has_are_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "run.csv").write_text(f"{text.FIRST}; times\n{line}\n", newline="")
+    with pytest.raises(BadDataError, match=r"run\.csv:2: the line of column names is damaged\.$"):
+        open_recording(tmp_path / "run.csv")
+
+
+def test_parquet_has_the_rows_of_every_group_and_none_of_an_empty_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows are written in groups, so that memory stays small."""
+    monkeypatch.setattr(parquet, "_CELLS", 24)
+    path = in_parquet(tmp_path / "run.parquet", [block([[k]], index=k) for k in range(5)])
+    assert [pq.ParquetFile(path).metadata.row_group(k).num_rows for k in range(3)] == [2, 2, 1]
+    assert pq.read_table(path)["arm/angle raw"].to_pylist() == [0, 1, 2, 3, 4]
+    empty = in_parquet(tmp_path / "empty.parquet", [])
+    assert pq.ParquetFile(empty).metadata.num_rows == 0
+    recording = open_recording(empty)
+    assert set(recording.facts) == {(ARM, 1), (HAND, 2), (HAND, 3)}
+    assert [entry for entry in recording.entries() if isinstance(entry, Block)] == []
+
+
+@pytest.mark.parametrize(
+    ("form", "raw", "held"),
+    [
+        ("unsigned integer, 2 octets", np.array([[5], [6]], dtype=object), [5, 6]),
+        ("unsigned integer, 2 octets", np.array([[5.0], [6.0]]), [5, 6]),
+        ("unsigned integer, 8 octets", np.array([[5], [2**64 - 1]], dtype=object), [5, 2**64 - 1]),
+        ("Float64, 8 octets", np.array([[5], [6]]), [5.0, 6.0]),
+        ("long integer, 9 octets", np.array([[5], [2**70]], dtype=object), ["5", str(2**70)]),
+        ("octets", np.array([[b"\0\xff"], [b""]], dtype=object), ["00ff", ""]),
+    ],
+)
+def test_raw_values_have_in_parquet_the_type_of_their_form(tmp_path: Path, form: str, raw: Any, held: Any) -> None:
+    writer = ParquetWriter(tmp_path / "run.parquet", [replace(ANGLE, sample_form=form)], STATION, wide=False)
+    writer.add_entry(block(raw, [[0.0]] * 2))
+    writer.finish()
+    assert pq.read_table(tmp_path / "run.parquet")["arm/angle raw"].to_pylist() == held
+
+
+@pytest.mark.parametrize(
+    ("form", "raw", "why"),
+    [
+        ("unsigned integer, 2 octets", np.array([[5.5]]), "unsigned integer, 2 octets: it is not a whole number."),
+        ("unsigned integer, 2 octets", np.array([[b"x"]], dtype=object), "unsigned integer, 2 octets: "),
+        ("unsigned integer, 2 octets", np.array([[2**64]], dtype=object), "unsigned integer, 2 octets: "),
+        ("Float32, 4 octets", np.array([[b"x"]], dtype=object), "Float32, 4 octets: "),
+        ("unsigned integer, 8 octets", np.array([[5.0]]), "unsigned integer, 8 octets: "),
+    ],
+)
+def test_a_raw_value_that_contradicts_its_datasheet_is_refused(tmp_path: Path, form: str, raw: Any, why: str) -> None:
+    writer = ParquetWriter(tmp_path / "run.parquet", [replace(ANGLE, sample_form=form)], STATION, wide=False)
+    writer.add_entry(block(raw, [[0.0]]))
+    with pytest.raises(BadDataError) as refused:
+        writer.finish()
+    writer.close()
+    assert refused.value.message.startswith(f"A raw value of angle of {ARM} is no {why}")
+
+
+def test_parquet_of_another_program_or_with_a_head_of_another_form_is_refused(tmp_path: Path) -> None:
+    whole = pq.read_table(in_parquet(tmp_path / "run.parquet", [block()]))
+    head = json.loads(whole.schema.metadata[b"teds-provision"])
+    assert head["format"] == "teds-provision/measurement-1"
+    for words, after in (
+        ("[", "[]"), ("[" * 100_000, "[]"), ("[]", "[]"), (json.dumps({**head, "format": "x"}), "[]"),
+        (json.dumps(head), "{}"), (json.dumps(head), "["),
+    ):  # fmt: skip
+        metadata = {"teds-provision": words, "teds-provision.log": after}
+        pq.write_table(whole.replace_schema_metadata(metadata), tmp_path / "other")
+        with pytest.raises(BadDataError) as refused:
+            open_recording(tmp_path / "other")
+        assert refused.value.message == f"{tmp_path / 'other'}: it is not a recording of this program."
+        assert refused.value.hint == "It was changed since it was written, or is damaged."
+    log = [
+        5,
+        {"event": "note", "time": "x", "why": "y" * 1001},
+        {"event": "x"},
+        {"uuid": ARM, "state": "lost", "time": 2},
+    ]
+    metadata = {"teds-provision": json.dumps(head), "teds-provision.log": json.dumps(log)}
+    pq.write_table(whole.replace_schema_metadata(metadata), tmp_path / "logged")
+    *_, note, report = open_recording(tmp_path / "logged").entries()
+    assert (note, report) == (Note(0.0, "y" * 1000), NodeReport(ARM, "lost", time=2.0))
+    metadata["teds-provision"] = json.dumps({**head, "channels": None, "wide": 1})
+    pq.write_table(whole.replace_schema_metadata(metadata), tmp_path / "nameless")
+    assert (open_recording(tmp_path / "nameless").facts, open_recording(tmp_path / "nameless").wide) == ({}, False)
+
+
+def test_of_a_report_parquet_keeps_the_last_of_each_node(tmp_path: Path) -> None:
+    reports = [
+        NodeReport(ARM, "running", time=1.0),
+        NodeReport(HAND, "lost", time=2.0),
+        NodeReport(ARM, "ended", time=3.0),
+    ]
+    path = in_parquet(tmp_path / "run.parquet", [block(), *reports, Note(4.0, "full")])
+    found = [entry for entry in open_recording(path).entries() if isinstance(entry, NodeReport | Note)]
+    assert found == [reports[1], reports[2], Note(4.0, "full")]
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("Not a footer.\nin thrift"), "Not a footer"),
+        (ValueError(), "ValueError"),
+        (OSError("x" * 201), "x" * 200),
+    ],
+)
+def test_of_an_error_of_pyarrow_the_first_line_is_quoted(error: Exception, line: str) -> None:
+    assert parquet._first_line(error) == line
+
+
+def test_without_pyarrow_parquet_is_refused_with_what_adds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = in_parquet(tmp_path / "run.parquet", [block()])
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UsageError) as refused:
+        open_recording(path)
+    assert refused.value.message == "Parquet needs pyarrow."
+    assert "install" in refused.value.hint
+    assert "[parquet]" in refused.value.hint
