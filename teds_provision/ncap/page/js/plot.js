@@ -327,8 +327,9 @@ function there(course, place, channel) {
 /** Clock time with as many digits as the columns are wide. */
 function exact(time, width) {
   const digits = width >= 1 ? 0 : width >= 0.1 ? 1 : 3;
-  const part = digits ? (time % 1).toFixed(digits).slice(1) : "";
-  return `${hours(part.length && Number(`0${part}`) >= 1 ? Math.floor(time) : time)}${part}`;
+  if (!digits) return hours(time);
+  const shown = time.toFixed(digits); // 59.98 s is 60.0 s with one digit
+  return `${hours(Number(shown))}${shown.slice(-digits - 1)}`;
 }
 
 const hours = (time) => (time === null ? "" : new Date(time * 1000).toTimeString().slice(0, 8));
