@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import Block, ChannelFacts
@@ -147,6 +150,76 @@ def test_a_bin_counts_to_its_end_and_no_further() -> None:
         assert bins.between(0, 9)[3][:, 0].tolist() == [most, most, 0 if coarse else most]
         bins.add(np.array([7]), np.array([1.0]), np.array([2.0]), many, 0)
         assert bins.between(0, 9)[3][0, 0] == most
+
+
+@dataclass
+class _Bin:
+    """What a bin should hold."""
+
+    segment: int
+    values: list[float] = field(default_factory=list)
+    counts: list[int] = field(default_factory=lambda: [0, 0, 0])
+
+
+class _PlainBins:
+    """What bins are to hold, without a ring: a dictionary of all samples that count."""
+
+    def __init__(self, size: int) -> None:
+        self.size, self.newest = size, -1
+        self.bins: dict[int, _Bin] = {}
+
+    def add_one(self, number: int, value: float, invalid: int, lost: int, segment: int) -> None:
+        """Take in a sample: bins are 1 s wide, and one that is older than 2 s means that the clock was put back."""
+        if self.newest >= 0 and number < self.newest - 2:
+            self.bins = {at: one for at, one in self.bins.items() if at < number}
+            self.newest = number
+        self.bins = {at: one for at, one in self.bins.items() if at < number or one.segment == segment}
+        self.newest = max(self.newest, number)
+        held = self.bins.setdefault(number, _Bin(segment))
+        if not math.isnan(value):
+            held.values.append(value)
+        for row, more in enumerate((1, invalid, lost)):
+            held.counts[row] += more
+        self.bins = {at: one for at, one in self.bins.items() if at > self.newest - self.size}
+
+
+_STEPS = st.one_of(st.integers(-2, 3), st.sampled_from([-9, -3, 7, 40, 60, 61, 200]))
+_VALUES = st.one_of(st.floats(-1e6, 1e6, width=32), st.just(math.nan), st.sampled_from([1.0, -1.0]))
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Bins(1.0, 60, coarse=False), lambda: Bins(1.0, 60, coarse=True), lambda: FewBins(1.0, 60)]
+)
+@given(
+    samples=st.lists(
+        st.tuples(_STEPS, _VALUES, st.booleans(), st.sampled_from([0, 0, 0, 4]), st.sampled_from([0, 0, 0, 1])),
+        max_size=120,
+    )
+)
+def test_bins_hold_what_a_list_of_all_samples_holds(
+    make: Callable[[], Bins | FewBins], samples: list[tuple[int, float, bool, int, int]]
+) -> None:
+    bins, plain, at, segment = make(), _PlainBins(60), 100, 0
+    for step, value, invalid, lost, other in samples:
+        at, segment = max(0, at + step), segment + other
+        for one in (bins, plain):
+            one.add_one(at, value, int(invalid), lost, segment)
+    numbers, low, high, counts = bins.between(0, at + 1000)
+    fine = isinstance(bins, Bins) and not bins.coarse
+    assert numbers.tolist() == sorted(plain.bins)
+    assert bins.segments_of(numbers).tolist() == [plain.bins[number].segment for number in numbers.tolist()]
+    for place, number in enumerate(numbers.tolist()):
+        wanted = plain.bins[number]
+        assert counts[:, place].tolist() == [*wanted.counts[:2], wanted.counts[2] if fine else 0]
+        if not wanted.values:
+            assert np.isnan(low[place])
+            assert np.isnan(high[place])
+            continue
+        assert low[place] == min(wanted.values)
+        over = float(high[place]) - max(wanted.values)
+        apart = max(wanted.values) - min(wanted.values)
+        coarse = isinstance(bins, Bins) and bins.coarse
+        assert 0.0 <= over <= (0.008 * apart + 1e-6 * max(map(abs, wanted.values)) if coarse else 0.0)
 
 
 def test_the_ring_of_an_hour_forgets_what_is_older() -> None:
