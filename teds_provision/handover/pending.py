@@ -1,7 +1,8 @@
 """Pending handovers: the stored record of a bundle, the receipt that closes it, and undoing a move.
 
-A bundle that left is ``open`` until its receipt comes (``closed``) or it is taken back (``undone``); one that came is
-``imported``. :class:`BundleNotes` holds what the columns of the table do not.
+A bundle that left is ``open`` until its receipt comes (``closed``), it is taken back (``undone``), or, for a copy, its
+parcel is given up (``dropped``; a receipt that comes all the same closes it). One that came is ``imported``.
+:class:`BundleNotes` holds what the columns of the table do not.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.database import chunks
 from teds_provision.station.store.records import Handover, Holder
 
-OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
+OPEN, CLOSED, UNDONE, DROPPED, IMPORTED = "open", "closed", "undone", "dropped", "imported"
 
 
 @dataclass(frozen=True)

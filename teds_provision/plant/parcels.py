@@ -468,7 +468,7 @@ def _drop_outdated(station: Station, roster: Roster) -> tuple[str, ...]:
             continue
         with station.durable(_COMMAND):
             parcels.forget_shared(row.id)
-            parcels.drop(row.id, "out")
+            _give_up(station, row)
             station.audit("export", None, "parcel dropped", parcel=row.id, handover=row.about, why=why)
         dropped.append(f"1 parcel dropped: {why}")
     return tuple(dropped)
@@ -484,7 +484,7 @@ def _expire(station: Station, now: datetime) -> None:
             handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
             with station.transaction():
                 parcels.forget_shared(row.id)
-                parcels.drop(row.id, "out")
+                _give_up(station, row)
             if handover is not None and handover.mode == "move" and handover.state == pending.OPEN:
                 nodes = tuple(
                     bytes.fromhex(uuid_hex) for uuid_hex in pending.BundleNotes.from_json(handover.nodes).uuids
@@ -492,6 +492,20 @@ def _expire(station: Station, now: datetime) -> None:
                 order = outgoing.ExportOrder((row.peer,), nodes, "move")
                 with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` reports it
                     send_export(station, outgoing.plan_export(station, order, now), now)
+
+
+def _give_up(station: Station, row: ParcelRow) -> None:
+    """Drop an outgoing parcel without a receipt. A copy is then over, unless it is in another parcel too.
+
+    A move stays open: its keys rest until it is sent again or undone.
+    """
+    parcels = station.plant.parcels
+    parcels.drop(row.id, "out")
+    handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
+    if handover is None or handover.mode != "copy" or handover.state != pending.OPEN:
+        return
+    if not any(other.about == row.about for other in parcels.all("out", "ready", "sent")):
+        station.handovers.put(replace(handover, state=pending.DROPPED))
 
 
 def _is_over(row: ParcelRow, now: datetime) -> bool:
@@ -512,7 +526,7 @@ def _note_refused(station: Station) -> None:
         if any(bundle == row.about and peer == me for bundle, peer, _ in claim.refused):
             with station.durable(_COMMAND):
                 parcels.turn_shared(row.id, "refused")
-                parcels.drop(row.id, "out")
+                _give_up(station, row)
 
 
 def _make_copies(station: Station, roster: Roster, views: Views, now: datetime) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from operator import itemgetter
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, merged_views, now, require_roster
@@ -24,6 +25,7 @@ SILENT: Final = timedelta(days=7)
 """A station whose newest page that counts is older than this is silent."""
 SHORTEST: Final = 4
 """So many digits of a UUID name a node."""
+_Stated = TypeVar("_Stated")
 
 
 @dataclass(frozen=True)
@@ -211,20 +213,34 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
                         key: [roster.name_of(fingerprint) for fingerprint in who] for key, who in holders.items()
                     },
                     "fingerprint": seen.pin,
-                    "pinned_by": {roster.name_of(fingerprint): pin for fingerprint, pin in seen.pins.items()},
+                    "pinned_by": _by_name(roster, seen.pins),
                     "sequence": newest[0] if newest is not None else None,
                     "written_by": newest[1] if newest is not None else None,
                     "profile": newest[2] if newest is not None else None,
                     "older_than": _older_than(roster, seen, here.get(uuid)),
                     "firmware": _firmware_to_json(roster, seen.firmware[0]) if seen.firmware else None,
-                    "firmware_by": {
-                        roster.name_of(reported.station): _firmware_to_json(roster, reported)
-                        for reported in seen.firmware
-                    },
+                    "firmware_by": _by_name(
+                        roster,
+                        {reported.station: _firmware_to_json(roster, reported) for reported in seen.firmware},
+                    ),
                     "revoked": [roster.name_of(statement.revocation.sender) for statement in seen.bans],
                 },
                 "conflicts": [{"name": conflict, "why": why} for conflict, why in seen.conflicts.items()],
             }
+
+
+def _by_name(roster: Roster, stated: Mapping[str, _Stated]) -> dict[str, _Stated]:
+    """Return what stations stated, by their names.
+
+    A member's name is unique; a removed station whose name the roster has twice is named with 16 digits of its key.
+    """
+    names = Counter(found.name for found in roster.by_key.values())
+    by_name: dict[str, _Stated] = {}
+    for fingerprint, value in stated.items():
+        name = roster.name_of(fingerprint)
+        unique = names[name] < 2 or roster.member(fingerprint) is not None
+        by_name[name if unique else f"{name} ({fingerprint[:16]})"] = value
+    return by_name
 
 
 def _older_than(roster: Roster, seen: MergedClaims, node: NodeRecord | None) -> str | None:

@@ -236,6 +236,26 @@ def test_heads_are_a_digest_of_the_newest_page_that_counts_of_every_chain(statio
 # -- what others say of a node -----------------------------------------------------------------------------------------
 
 
+def test_what_two_stations_of_one_name_state_of_a_node_is_shown_of_both(station: Station) -> None:
+    """A machine that was set up again has the name of its removed self."""
+    stations = others(station, west="line", east="line", was_west="base", once="base", twice="base", again="base")
+    names = ("west", "east", "west", "once", "twice", "twice")
+    removed = [
+        RemovedMember(name, one.point, one.roles, "lost", (1, H)) for one, name in zip(stations, names, strict=True)
+    ]
+    now = held(station, *stations[:2], removed=tuple(removed[2:]))
+    with station.transaction():
+        for number, one in enumerate(stations):
+            claim = Claim(pin=(f"{number}" * 64, "tap"), firmware=(None, f"2026-03-01T00:00:0{number}Z"))
+            station.plant.claims.put(station.plant.pages.chain(one.fingerprint).id, {NODE: claim.to_json()})
+    digits = [one.fingerprint[:16] for one in stations]
+    named = ["west", "east", f"west ({digits[2]})", "once", f"twice ({digits[4]})", f"twice ({digits[5]})"]
+    [shown] = status.nodes(station, now)
+    assert shown["says"]["pinned_by"] == {name: f"{number}" * 64 for number, name in enumerate(named)}
+    at = {name: f"2026-03-01T00:00:0{number}Z" for number, name in enumerate(named)}
+    assert {name: one["at"] for name, one in shown["says"]["firmware_by"].items()} == at
+
+
 def test_a_datasheet_that_is_older_than_one_that_a_member_with_sign_wrote_is_shown(station: Station) -> None:
     members = others(station, west="line sign", south="sign", east="line", left="sign")
     gone = members.pop()

@@ -142,6 +142,18 @@ def test_a_copy_that_expired_while_it_waited_makes_room_for_the_next_one(plant: 
     assert waits(plant["south"]) == []
 
 
+def test_a_receipt_that_comes_after_its_copy_expired_closes_it_all_the_same(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    west = plant["west"]
+    board_of(west, os.urandom(10))
+    sync(plant, "west", "south")
+    plant.roster(ROLES)  # no other copy is made
+    parcels.send_out(west, plant.transport, plant.views("west"), now(8))
+    assert [(one.row.state, one.expired) for one in pending.list_handovers(west, now(8))] == [("dropped", False)]
+    sync(plant, "west")
+    assert [row.state for row in west.handovers.all()] == ["closed"]
+
+
 def test_an_order_that_is_given_again_is_the_same_parcel_until_that_has_expired(plant: Plant) -> None:
     plant.roster(ROLES)
     station = plant["west"]
@@ -476,6 +488,8 @@ def test_a_key_that_is_outdated_does_not_leave_with_a_copy_that_waits(plant: Pla
     assert [entry.outcome for entry in west.audit_log.entries() if entry.act == "export"][-2:] == [
         "parcel dropped", "done"
     ]  # fmt: skip
+    listed = pending.list_handovers(west, now())
+    assert sorted((one.row.state, one.expired) for one in listed) == [("dropped", False), ("open", False)]
     sync(plant, "south")
     assert holds(south, other.uuid) == [(1, "import")]
     assert holds(south, board.uuid) == ([(2, "import")] if happens is rotated else [])

@@ -197,6 +197,8 @@ def test_of_what_expired_without_a_receipt_an_open_move_goes_again_and_a_copy_is
         ("closed move", "move", "closed", "2026-03-01T12:00:00Z"),
         ("undone move", "move", "undone", "2026-03-01T12:00:00Z"),
         ("copy", "copy", "open", "2026-03-01T12:00:00Z"),
+        ("closed copy", "copy", "closed", "2026-03-01T12:00:00Z"),
+        ("twice", "copy", "open", "2026-03-01T12:00:00Z"),
     ]
     with station.transaction():
         for name, mode, state, expires in cases:
@@ -204,9 +206,15 @@ def test_of_what_expired_without_a_receipt_an_open_move_goes_again_and_a_copy_is
             station.handovers.put(Handover(name, "out", mode, (SOUTH,), state, notes))
             parcels.put(ParcelRow(name, "out", SOUTH, "bundle", "sent", expires, name, "", "2026-02-22T12:00:00Z"), b"")
             parcels.put_shared([(A, len(name))], SOUTH, name, "sent")
+        again_at = "2026-03-08T12:00:00Z"
+        parcels.put(ParcelRow("2", "out", SOUTH, "bundle", "ready", again_at, "twice", "", "2026-03-01T12:00:00Z"), b"")
     _expire(station, NOW)
     assert again == [(SOUTH, (A,), "move")]
-    assert [row.id for row in parcels.all("out", "ready", "sent")] == ["young move"]
+    assert [row.id for row in parcels.all("out", "ready", "sent")] == ["young move", "2"]
+    assert {row.id: row.state for row in station.handovers.all()} == {
+        "open move": "open", "young move": "open", "closed move": "closed", "undone move": "undone", "copy": "dropped",
+        "closed copy": "closed", "twice": "open",
+    }, "handover list shows as open what may still be receipted"  # fmt: skip
     assert [name for name, *_ in cases if parcels.shared_in(name)] == ["young move"], "to be shared once more"
 
 
@@ -220,12 +228,16 @@ def test_a_receiver_refuses_on_its_own_page_what_came_from_here(station: Station
             row = ParcelRow(bundle, "out", SOUTH, "bundle", "sent", "2026-03-08T12:00:00Z", bundle)
             parcels.put(row, b"")
             parcels.put_shared([(A, int(bundle[-1]))], SOUTH, bundle, "sent")
+            left = BundleNotes((A.hex(),), "content", "ca", "2026-03-08T12:00:00Z").to_json()
+            station.handovers.put(Handover(bundle, "out", "copy", (SOUTH,), "open", left))
         for digits, refused in said.items():
             chain = station.plant.pages.chain(digits)
             station.plant.claims.put(chain.id, {A: Claim(refused=refused).to_json()})
     _note_refused(station)
     assert [row.id for row in parcels.all("out", "sent")] == bundles[1:]
     assert [parcels.shared_in(bundle)[0][2] for bundle in bundles] == ["refused", "sent", "sent", "sent"]
+    states = {row.id: row.state for row in station.handovers.all()}
+    assert [states[bundle] for bundle in bundles] == ["dropped", "open", "open", "open"]
 
 
 def test_a_receipt_waits_seven_days_and_a_bundle_until_it_expires(station: Station) -> None:
