@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,16 +18,16 @@ from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.plant import office
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.office import RequestAheadError, _RefusedError, _require_name, _text_of
-from teds_provision.plant.sign_requests import name_of, receivers
+from teds_provision.plant.sign_requests import Delivery, name_of, receivers
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
-from teds_provision.protocol.plant.job import Job
+from teds_provision.protocol.plant.job import CalibrationRule, Job
 from teds_provision.protocol.plant.signing import SignRequest, open_request, seal_request
 from teds_provision.station.plant.line import UnitRow
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from tests.bench import Board
 
-from .owner import job_of
+from .owner import NOW, job_of
 from .stations import Plant
 from .test_jobs import make_board
 from .test_office import Desk, LocalOffice, proven
@@ -302,3 +304,98 @@ def test_another_board_that_shows_the_key_of_a_listed_one_has_no_field_102(desk:
         key_signature=other.key.sign(node_key_message(other.uuid, SoftwareKey(9).point)),
     )  # fmt: skip
     assert desk.asks(proven(moved, desk.line, board)).why == "field 102 does not sign this key for this UUID"
+
+
+DAY = timedelta(days=1)
+ANGLES = b"raw, value\n0, 0\n1, 1\n"
+ONE = CalibrationRule("one", hashlib.sha256(ANGLES).hexdigest())
+LISTED = CalibrationRule("list", by_uuid={UUID: hashlib.sha256(ANGLES).hexdigest()})
+RECENT = CalibrationRule("any", max_age_days=30)
+TOO_OLD = "the calibration is older than 30 days, or has no date"
+OTHER_ONE = "the calibration is not the one the job specifies"
+HAS_NONE = "the job requires a calibration, and the request has none"
+
+
+@pytest.mark.parametrize(
+    ("rule", "octets", "dates", "why"),
+    [
+        (CalibrationRule(), None, [], ""),
+        (CalibrationRule(), ANGLES, [NOW], "the job does not allow a calibration"),
+        *((rule, None, [], HAS_NONE) for rule in (ONE, LISTED, RECENT)),
+        (RECENT, b" " * (1 << 20), [NOW], ""),
+        (RECENT, b" " * ((1 << 20) + 1), [NOW], HAS_NONE),
+        *((rule, ANGLES, [None], "") for rule in (ONE, LISTED)),  # the very file: its date does not count
+        *((rule, ANGLES + b"\n", [NOW], OTHER_ONE) for rule in (ONE, LISTED)),
+        (CalibrationRule("list", by_uuid={bytes(10): LISTED.by_uuid[UUID]}), ANGLES, [NOW], OTHER_ONE),
+        (RECENT, ANGLES, [NOW, NOW - 30 * DAY, NOW + DAY], ""),
+        (RECENT, ANGLES, [NOW, NOW - 30 * DAY - timedelta(seconds=1)], TOO_OLD),
+        (RECENT, ANGLES, [NOW + DAY + timedelta(seconds=1), NOW], TOO_OLD),
+        (RECENT, ANGLES, [NOW, None], TOO_OLD),
+    ],
+)
+def test_an_office_takes_the_calibration_that_the_job_asks_for(
+    monkeypatch: pytest.MonkeyPatch, rule: CalibrationRule, octets: bytes | None, dates: list[Any], why: str
+) -> None:
+    found = {channel: SimpleNamespace(date=date) for channel, date in enumerate(dates, 1)}
+    monkeypatch.setattr(office, "read_calibrations", lambda _text, _name, profile: {"profile": found}[profile])
+    made, asked = SimpleNamespace(calibration=rule), SimpleNamespace(uuid=UUID, calibration=octets)
+    if not why:
+        taken: Any = office._calibrations(cast("Job", made), cast("SignRequest", asked), cast("Any", "profile"), NOW)
+        assert taken == ({} if octets is None else found)
+        return
+    with pytest.raises(_RefusedError) as error:
+        office._calibrations(cast("Job", made), cast("SignRequest", asked), cast("Any", "profile"), NOW)
+    assert (error.value.word, error.value.why) == ("job", why)
+
+
+def test_what_the_pins_or_the_guard_refuse_is_answered_with_their_reason(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+
+    def refuses(why: str) -> Any:
+        def refused(*_: Any, **__: Any) -> None:
+            raise PolicyError(why)
+
+        return refused
+
+    with monkeypatch.context() as patch:
+        patch.setattr(desk.office.pins, "check", refuses("Keepers pin another key."))
+        reply = desk.asks(request)
+    assert (reply.refused, reply.why) == ("other-key", "Keepers pin another key.")
+    with monkeypatch.context() as patch:
+        patch.setattr(office, "guard", refuses("The calibration belongs to another sensor."))
+        reply = desk.asks(request)
+    assert (reply.refused, reply.why) == ("guard", "The calibration belongs to another sensor.")
+    assert desk.asks(request).refused == "", "neither is remembered"
+
+
+def test_an_office_answers_in_turn_and_takes_away_what_it_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One from the future stays, that of a station that left is answered to nobody, a foreign one is thrown away."""
+    notices, sent, gone = list[str](), list[tuple[str, bytes, str]](), list[str]()
+    roster = SimpleNamespace(point_of=lambda _: b"", member=lambda digits: digits if digits == "west" else None)
+    station: Any = SimpleNamespace(notice=notices.append, point=b"point")
+
+    def answered(_station: Any, document: bytes, jobs: Any) -> bytes | None:
+        assert jobs == {"job"}
+        if document == b"ahead":
+            raise RequestAheadError("It is not time yet.")
+        return None if document == b"foreign" else b"answer to " + document + b".signature"
+
+    monkeypatch.setattr(office, "answer", answered)
+    monkeypatch.setattr(office, "roster_of", lambda _: roster)
+    monkeypatch.setattr(office, "open_request", lambda document, _: SimpleNamespace(signer=document.decode()))
+    monkeypatch.setattr(office, "open_answer", lambda sealed, point_of: (sealed, point_of("anybody")))
+    monkeypatch.setattr(office, "send", lambda _s, _t, to, sealed, name: sent.append((to, sealed, name)))
+    names = ["ahead", "west", "left", "foreign", "west"]
+    inbox: Any = SimpleNamespace(
+        collect=lambda: [Delivery(name.encode(), partial(gone.append, f"{at} {name}")) for at, name in enumerate(names)]
+    )
+    done = list(office.answer_all(station, cast("Any", None), inbox, {"job"}, stop=lambda: len(gone) == 3))
+    assert [(one.request.signer, one.answer) for one in done] == [
+        ("west", (b"answer to west.signature", b"point")), ("left", (b"answer to left.signature", b"point"))
+    ]  # fmt: skip
+    assert sent == [("west", b"answer to west.signature", name_of(hashlib.sha256(b"answer to west").hexdigest()))]
+    assert gone == ["1 west", "2 left", "3 foreign"], "it was stopped before the last one"
+    assert notices == ["Not signed: It is not time yet."]

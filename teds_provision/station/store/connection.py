@@ -381,7 +381,8 @@ class Connection:
 
     def _failure(self, error: Exception) -> TedsProvisionError:
         """Return the error to raise in place of one of SQLite, of the system, or of a text."""
-        if isinstance(error, UnicodeDecodeError):  # SQLite's message contains octets of a damaged file
+        # the message contains octets of the damaged file; the driver's own error has no code
+        if isinstance(error, UnicodeDecodeError) or str(error).startswith("Could not decode to UTF-8"):
             return self._damaged()
         if isinstance(error, sqlite3.Error | OSError):
             if self._frozen is not None and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY:
