@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
+from teds_provision.errors import LinkError
 from teds_provision.ncap.web import server
 from teds_provision.ncap.web.guard import CALLER, Receive, Scope, Send
 from tests.pace import PATIENCE
@@ -44,6 +45,19 @@ def served(work: Callable[[Callable[[], Awaitable[Pair]]], Awaitable[None]]) -> 
             await servers.stop()
 
     asyncio.run(run())
+
+
+def test_an_address_that_cannot_be_served_on_is_named_with_the_remedy() -> None:
+    with server.listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        places = (("127.0.0.1", port, "Address already in use"), ("192.0.2.1", 0, "Cannot assign requested address"))
+        for host, number, why in places:
+            with pytest.raises(LinkError) as refused:
+                server.listen(host, number)
+            assert refused.value.message == f"Cannot serve the page on {host}:{number}: {why}."
+            assert refused.value.hint == "Choose another address with --http."
+    with pytest.raises(LinkError, match=r"^Cannot serve the page on 127\.0\.0\.1:65536: .*0-65535"):
+        server.listen("127.0.0.1", 65536)
 
 
 async def is_ended(pair: Pair) -> bool:

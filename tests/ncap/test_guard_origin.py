@@ -53,6 +53,9 @@ def status_of(guard: Guard, headers: dict[str, str], kind: str = "http", *, more
         await guard({"type": kind, "method": "GET", "path": "/api/v1/live", "headers": pairs}, receive, send)
 
     asyncio.run(run())
+    prefix = "websocket." if kind == "websocket" else ""
+    kinds = [message["type"] for message in sent]
+    assert kinds == [f"{prefix}http.response.{part}" for part in ("start", "body")[: len(sent)]]
     return int(sent[0]["status"])
 
 
@@ -96,6 +99,28 @@ def test_a_browsers_websocket_names_its_origin(tmp_path: Path) -> None:
     assert status_of(guard, cookie, "websocket") == 403
     assert status_of(guard, {**cookie, "origin": f"http://{HERE}"}, "websocket") == 200
     assert status_of(guard, {**cookie, "origin": "http://evil.example"}, "websocket") == 403
+
+
+@pytest.mark.parametrize("cookie", ["a[b]=1", 'x="', "no pair", f"ncap-{PORT}", "=", ";;;"])
+def test_a_cookie_that_nobody_can_read_is_none(tmp_path: Path, cookie: str) -> None:
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    assert status_of(guard, {"host": HERE, "cookie": cookie}) == 401
+    assert status_of(guard, {"host": HERE, "cookie": cookie, "authorization": f"Bearer {tokens.add('script')}"}) == 200
+
+
+def test_what_is_no_request_passes_the_guard(tmp_path: Path) -> None:
+    """Servers tell applications of their start and end in the same way, without headers."""
+    came: list[str] = []
+
+    async def any_app(scope: Scope, _receive: Receive, _send: Send) -> None:
+        came.append(scope["type"])
+
+    async def nothing(*_: object) -> Any:
+        raise AssertionError
+
+    asyncio.run(Guard(any_app, Tokens(tmp_path), front((), PORT, tls=False))({"type": "lifespan"}, nothing, nothing))
+    assert came == ["lifespan"]
 
 
 def test_the_users_own_socket_has_no_origin_to_compare(tmp_path: Path) -> None:

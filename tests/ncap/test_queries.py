@@ -183,15 +183,22 @@ def test_names_of_clause_12_are_separated_by_commas_alone_and_a_module_keeps_its
         ("TEDSManager/ReadTeds", "timId=1&tedsType=1&format=0", "text", '0\n1\n0\n1\n{"UUID": "aa"}\n'),
         ("TEDSManager/ReadTeds", "timId=1&channelId=1&tedsType=3&format=0", "text", '0\n1\n1\n3\n{"Unit": "°"}\n'),
         ("TEDSManager/ReadTeds", "timId=1&tedsType=3&format=0", "text", "1\nNode aa has no TEDS 3 of channel 0.\n"),
-        ("TEDSManager/ReadRawTeds", "timId=1&tedsType=1&format=0", "text", "4\nThe node is busy.\n"),
+        ("TEDSManager/ReadRawTeds", "timId=1&tedsType=1&format=0", "text", "0\n1\n0\n1\nAAEC/w==\n"),
+        ("TEDSManager/ReadRawTeds", "timId=1&channelId=2&tedsType=3&format=0", "text",
+         "1\nNode aa has no TEDS 3 of channel 2.\n"),
+        ("TEDSManager/ReadRawTeds", "timId=bb&tedsType=1&format=0", "text", "4\nThe node is busy.\n"),
     ],
 )  # fmt: skip
 def test_the_answers_of_clause_12(path: str, query: str, kind: str, body: str) -> None:
     def known(word: str) -> str:
+        if word == "bb":
+            return word
         raise NotFoundError(f"No node matches {word}.")
 
-    def busy(_uuid: str) -> None:
-        raise NodeBusyError("The node is busy.")
+    def read(uuid: str) -> Any:
+        if uuid == "bb":
+            raise NodeBusyError("The node is busy.")
+        return SimpleNamespace(image=SimpleNamespace(blocks={(0, 1): b"\x00\x01\x02\xff"}))
 
     values = {1: SimpleNamespace(value=2.5, time=7.0), 2: SimpleNamespace(value=None, time=7.0)}
     teds = [
@@ -206,7 +213,7 @@ def test_the_answers_of_clause_12(path: str, query: str, kind: str, body: str) -
             channel_names=lambda _uuid: [(number, "") for number in (1, 2, 3)],
         ),
         live=SimpleNamespace(last=lambda _uuid, channel: values.get(channel)),
-        sheets=SimpleNamespace(as_json=lambda _uuid: ({"teds": teds}, "digest"), read=busy),
+        sheets=SimpleNamespace(as_json=lambda _uuid: ({"teds": teds}, "digest"), read=read),
     )
     asked = request(query)
     asked.scope["path_params"] = {"path": path}
@@ -216,6 +223,18 @@ def test_the_answers_of_clause_12(path: str, query: str, kind: str, body: str) -
     }[kind])  # fmt: skip
     text = bytes(answer.body).decode()
     assert body in text if kind == "xml" else text == body
+
+
+def test_another_path_of_clause_12_is_refused_with_those_that_are_there() -> None:
+    asked = request()
+    asked.scope["path_params"] = {"path": "TransducerAccess/WriteData"}
+    with pytest.raises(NotFoundError) as refused:
+        asyncio.run(Clause12(cast("Any", None))._answer(asked))
+    assert (refused.value.message, refused.value.hint) == (
+        "This clause 12 path is not supported.",
+        "Supported: Discovery/TIMDiscovery, Discovery/TransducerDiscovery, TransducerAccess/ReadData,"
+        " TEDSManager/ReadTeds, TEDSManager/ReadRawTeds.",
+    )
 
 
 @pytest.mark.parametrize("read_only", [False, True])
