@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import timedelta
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -19,9 +21,19 @@ from teds_provision.errors import (
 )
 from teds_provision.protocol.messages.frames import Command, Reason, Reply, refusal
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.protocol.wire_agreement import key_id
-from teds_provision.provisioning.agree import AgreeResult, agree, open_session, require_session
-from teds_provision.provisioning.conversation import Conversation
+from teds_provision.protocol.wire_agreement import TranscriptMismatchError, key_id
+from teds_provision.provisioning import agree as agree_module
+from teds_provision.provisioning.agree import (
+    AgreeResult,
+    _agree_anew,
+    _pin_for,
+    agree,
+    open_session,
+    require_session,
+    session_if_keyed,
+    unknown_key,
+)
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
@@ -467,3 +479,115 @@ def test_the_first_open_under_a_new_key_knows_both_static_keys(
     run(station, board)
     run(station, board)
     assert opened == [(station.point, board.key.point)] * 2
+
+
+DIGITS = "ab" * 32
+
+
+@pytest.mark.parametrize(
+    ("pinned", "tapped", "wired", "state", "assurance"),
+    [
+        (DIGITS, False, False, NodeState.KEYED, "import"),
+        (DIGITS, True, True, NodeState.FACTORY, "import"),
+        (None, True, False, NodeState.KEYED, "tap"),
+        (None, True, True, NodeState.FACTORY, "tap"),
+        (None, False, True, NodeState.FACTORY, "bus"),
+        (None, False, True, NodeState.KEYED, None),
+        (None, False, False, NodeState.FACTORY, None),
+    ],
+)
+def test_a_key_is_pinned_by_a_tap_or_over_the_bus_of_a_new_node_and_never_anew(
+    pinned: str | None, tapped: bool, wired: bool, state: NodeState, assurance: str | None
+) -> None:
+    uuid, fingerprint = bytes(range(10)), "cd" * 32
+    entry = WhitelistEntry(uuid, fingerprint=pinned, assurance="import" if pinned else "uuid")
+    node: Any = SimpleNamespace(uuid=uuid, tapped=tapped, wired=wired)
+    who: Any = SimpleNamespace(state=state, fingerprint=fingerprint)
+    if assurance is None:
+        with pytest.raises(
+            PolicyError, match=f"{uuid.hex()} is whitelisted by UUID only; its key can only be"
+        ) as refused:
+            _pin_for(entry, node, who)
+        assert refused.value.hint.startswith("Tap it once (--via nfc), or add the fingerprint: whitelist add UUID")
+        return
+    found = _pin_for(entry, node, who)
+    assert (found.fingerprint, found.assurance) == (pinned or fingerprint, assurance)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_node_that_shows_two_keys_in_one_agreement_gets_none(
+    station: Station, monkeypatch: pytest.MonkeyPatch, same: bool
+) -> None:
+    """A Security TEDS that changed on the way is read once more; with another key two boards answer, or a copy."""
+    asked: list[tuple[bytes, bytes]] = []
+
+    def request(_station: Any, _node: Any, _entry: Any, ca: bytes, teds: bytes) -> Any:
+        asked.append((ca, teds))
+        if len(asked) == 1:
+            raise TranscriptMismatchError("It changed.")
+        raise PolicyError("Asked again.")
+
+    keys = {b"before": b"one key", b"again": b"one key" if same else b"another key"}
+    monkeypatch.setattr(agree_module, "_request", request)
+    monkeypatch.setattr(agree_module, "read_block", lambda _node, _block: b"again")
+    monkeypatch.setattr(agree_module, "fit_to_agree", lambda teds, *_: SimpleNamespace(node_key=keys[teds]))
+    node: Any = SimpleNamespace(uuid=bytes(10))
+    with pytest.raises(PolicyError if same else NotAuthenticError) as refused:
+        _agree_anew(station, node, WhitelistEntry(bytes(10), fingerprint=DIGITS), b"ca", b"before")
+    assert asked == [(b"ca", b"before"), (b"ca", b"again")][: 2 if same else 1]
+    if not same:
+        assert refused.value.message == "The node presented two different keys."
+        assert refused.value.hint.startswith("Either two boards are answering, or the tag is a copy.")
+
+
+def test_a_session_that_is_lost_while_a_key_is_agreed_on_ends_with_its_cause(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cause = NodeSilentError("It is silent.")
+
+    def lose(*_: Any, **__: Any) -> Any:
+        raise SessionLostError(cause)
+
+    whitelist(station, board)
+    with monkeypatch.context() as patch:
+        patch.setattr(agree_module, "_agree_anew", lose)
+        with pytest.raises(NodeSilentError) as lost:
+            run(station, board)
+    assert lost.value is cause
+    run(station, board)
+    monkeypatch.setattr(type(station.keys), "rotates_now", lambda *_: True)
+    monkeypatch.setattr(agree_module, "_agree_anew", lose)
+    with talk(board) as node, pytest.raises(NodeSilentError) as lost:
+        session_if_keyed(station, node)
+    assert lost.value is cause
+
+
+@pytest.mark.parametrize(
+    ("another", "elsewhere", "foreign", "message", "hint"),
+    [
+        (True, "", False, "It shows another key.", "x"),
+        (False, "", False, ". That answer is unsigned and proves nothing.", "Try it on the reader. If it was reset"),
+        (False, "it is at 3", False, "; it is at 3.", "Use it at that station, or have the key handed over."),
+        (False, "it is at 3", True, "; it is at 3.", None),
+        (False, "", True, ". That answer is unsigned and proves nothing.", "Try it on the reader. If it was reset"),
+    ],
+)
+def test_a_node_that_knows_none_of_our_keys_is_explained_by_what_else_it_shows(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    another: bool,
+    elsewhere: str,
+    foreign: bool,
+    message: str,
+    hint: str | None,
+) -> None:
+    node: Any = SimpleNamespace(uuid=bytes(10))
+    shown = PolicyError("It shows another key.", hint="x") if another else None
+    monkeypatch.setattr(agree_module, "_shows_another_key", lambda *_: shown)
+    monkeypatch.setattr(agree_module, "agreed_elsewhere", lambda *_: elsewhere)
+    monkeypatch.setattr(agree_module, "_signed_for_another_ca", lambda *_: foreign)
+    monkeypatch.setattr(agree_module, "_shown_security", lambda _node: b"")
+    error = unknown_key(station, node)
+    assert error.message.endswith(message)
+    assert another or error.message.startswith(f"No session with node {bytes(10).hex()}: it answers that it knows none")
+    assert error.hint == agree_module.OTHER_OWNER_REMEDY if hint is None else error.hint.startswith(hint)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -18,6 +18,7 @@ from teds_provision.errors import (
     NoNodeError,
     NotAuthenticError,
     PolicyError,
+    TedsProvisionError,
     UsageError,
     VaultLockedError,
 )
@@ -34,13 +35,15 @@ from teds_provision.provisioning.batch_sheet import (
     write_report,
 )
 from teds_provision.provisioning.board_type import WrongBoardError
-from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.build import BuildOrder, compose, named_for
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.station.store.records import NodeRecord, WhitelistEntry
 from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
 from tests.bench import Board, contact
 from tests.pace import PATIENCE
 
@@ -728,3 +731,101 @@ def test_a_vault_that_is_locked_meanwhile_ends_the_run_and_is_no_fault_of_a_boar
     with pytest.raises(VaultLockedError) as locked:
         next(boards)
     assert locked.value.exit_code == 7
+
+
+def clock(patch: pytest.MonkeyPatch, *moments: float) -> None:
+    """Let the batch read these moments from the clock, one after the other."""
+    left = list(moments)
+    patch.setattr(batch, "time", SimpleNamespace(monotonic=lambda: left.pop(0), sleep=None))
+
+
+def test_in_the_plans_of_a_bus_a_refused_board_has_its_reason_and_ends_no_other(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (1, 2, 3):
+        station.pins.put(WhitelistEntry(uuid_of(number), assurance="tap"))
+    bus, run = Bus(answer(1), answer(2), answer(3)), run_of(station, whole_bus=True)
+    refused, silent = PolicyError("It is another owner's."), NodeSilentError("It is silent.")
+    failures = {uuid_of(1): refused, uuid_of(2): SessionLostError(silent)}
+
+    def plan_for(node: Conversation) -> Any:
+        if node.uuid in failures:
+            raise failures[node.uuid]
+        return node.uuid
+
+    monkeypatch.setattr(batch, "open_port", lambda _links: bus)
+    monkeypatch.setattr(run, "_plan_for", plan_for)
+    monkeypatch.setattr(run, "_on_the_bus", lambda _port: (None, bus.answers))
+    clock(monkeypatch, 100.0, 102.5, 200.0, 200.25, 300.0)
+    first, second, third = run.plans()
+    assert third == uuid_of(3)
+    assert (first, second) == (
+        BoardResult(uuid_of(1), 2.5, None, refused, None, "can:test", first.time),  # type: ignore[union-attr]
+        BoardResult(uuid_of(2), 0.25, None, silent, None, "can:test", second.time),  # type: ignore[union-attr]
+    )
+    assert (run.ended, run.worst, run.passed, bus.closed) == (2, refused, 0, 1)
+
+
+@pytest.mark.parametrize("error", [NodeSilentError("It is silent."), PolicyError("No.")], ids=["lost", "refused"])
+def test_a_board_that_fails_has_its_reason_place_and_time_and_of_a_lost_session_the_cause(
+    station: Station, monkeypatch: pytest.MonkeyPatch, error: TedsProvisionError
+) -> None:
+    def provision(*_: object) -> Any:
+        raise SessionLostError(error) if isinstance(error, NodeSilentError) else error
+
+    run = run_of(station, whole_bus=True)
+    monkeypatch.setattr(run, "_was_finished_elsewhere", lambda _node: False)
+    monkeypatch.setattr(run, "_provision", provision)
+    clock(monkeypatch, 100.0, 104.5)
+    ended = run._board(answer(1), "can:test", Operator())
+    assert ended is not None
+    assert (ended.error, ended.seconds, ended.place, ended.row, ended.done) == (error, 4.5, "can:test", None, None)
+
+
+def test_without_a_sheet_those_have_passed_that_did_in_this_run_and_of_a_job_those_of_all_runs(
+    station: Station,
+) -> None:
+    run, verified = run_of(station, whole_bus=True), Verification(uuid_of(1), (Check("signed", "passed"),))
+    done: Any = SimpleNamespace(verified=verified, warnings=("old",), steps=())
+    for number, error in ((1, None), (2, PolicyError("No.")), (3, None)):
+        run._note(BoardResult(uuid_of(number), 1.0, done, error))
+    assert (run.passed, run.ended, len(run), run.of_a_job) == (2, 3, 0, False)
+    assert run.board_warnings == {"old": [uuid_of(1), uuid_of(2), uuid_of(3)]}
+    for total, passed in ((12, 7), (0, 2)):
+        run.line = cast(Any, SimpleNamespace(total=total, passed=7))
+        assert (run.passed, len(run), run.of_a_job) == (passed, total, total > 0)
+
+
+def test_a_job_that_only_verifies_writes_nothing(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, node, line = run_of(station), cast(Any, object()), cast(Any, SimpleNamespace(only_verify=True, total=0))
+    run.line = line
+    monkeypatch.setattr(batch, "verify_only", lambda *given: given)
+    monkeypatch.setattr(batch, "provision", lambda *_, **__: "provisioned")
+    assert run._provision(node, Operator()) == (station, node, line, run._reporter)
+    line.only_verify = False
+    assert run._provision(node, Operator()) == "provisioned"
+
+
+def test_a_row_is_done_already_if_the_board_has_what_the_row_gives(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uuid, gripper, other = uuid_of(1), load_profile("gripper"), load_profile("limit-switch")
+    sheets = read_sheet(station, sheet(tmp_path, "uuid,name,profile\n,hand,gripper\n,arm,gripper\n"), BuildOrder())
+    hand, arm = sheets.rows
+    built = compose(station, uuid, named_for(station, uuid, hand.prepared), Image(uuid, {}), edition=2007).blocks
+    images: dict[str, Image | None] = {
+        "what it gives": Image(uuid, built),
+        "another type": Image(uuid, other.build(uuid, name="hand").blocks),
+        "another name": Image(uuid, gripper.build(uuid, name="foot").blocks),
+        "less": Image(uuid, dict(list(built.items())[:-1])),
+        "nothing": None,
+    }
+    found = {}
+    for what, image in images.items():
+        monkeypatch.setattr(type(station.datasheets), "datasheet", lambda _own, _uuid, image=image: image)
+        found[what] = (batch._has_it_already(station, hand, uuid), batch._has_it_already(station, arm, uuid))
+    assert found == {what: (what == "what it gives", False) for what in images}
+    monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: images["what it gives"])
+    with station.transaction():
+        station.nodes.put(NodeRecord(uuid_of(2), name="hand"))
+    assert not batch._has_it_already(station, hand, uuid), "another node has that name now"

@@ -11,15 +11,24 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadDatasheetError, NotAuthenticError
+from teds_provision.errors import (
+    BadDataError,
+    BadDatasheetError,
+    KeyMismatchError,
+    NotAuthenticError,
+    NotFoundError,
+    StoreChangedError,
+)
 from teds_provision.measure import background_reread
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.verified_session import open_trusted
+from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.provisioning import identify as identify_module
 from teds_provision.provisioning import readings
 from teds_provision.provisioning.agree import require_session
@@ -29,14 +38,15 @@ from teds_provision.provisioning.inventory import inventory
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.sign import known_node_keys
 from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify import possession_check
+from teds_provision.provisioning.verify import freshness_floor_of, possession_check, snapshot_trust
 from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_at_node, verify_in_session
 from teds_provision.provisioning.write import write
+from teds_provision.shapes.verdict import Check
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
-from teds_provision.teds.image import SECURITY
+from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.handover.desk import Pair, provisioned
 
@@ -409,3 +419,85 @@ def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, bo
         failed = possession_check(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
         readings.keep(station, node, read_image(node), by="verify", floor=None, more=[failed])
     assert shown(station, board) == ("not authentic", "session")
+
+
+def test_a_pin_that_another_program_changed_costs_that_node_alone_its_verdict(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = Board(uuid=bytes(range(10)))
+    provisioned(station, other)
+    judge, judged = readings._judged, list[bool]()
+
+    def changed(*_: Any) -> Any:
+        raise StoreChangedError("A pin was changed by another program.")
+
+    def judged_or_changed(trust: Any, row: NodeReading, *, keyed: bool) -> Any:
+        if row.uuid == other.uuid:
+            changed()
+        judged.append(keyed)
+        return judge(trust, row, keyed=keyed)
+
+    before = readings.verdicts_of(station, [board.uuid, other.uuid], [board.uuid])
+    monkeypatch.setattr(readings, "snapshot_trust_of", changed)
+    monkeypatch.setattr(readings, "_judged", judged_or_changed)
+    found = readings.verdicts_of(station, [board.uuid, other.uuid], [board.uuid])
+    assert (found[board.uuid], judged) == (before[board.uuid], [True])
+    verdict, row = found[other.uuid], station.datasheets.reading(other.uuid)
+    assert row is not None
+    assert verdict.verified.checks == (Check("node key", "failed", "A pin was changed by another program."),)
+    assert (verdict.verified.verdict, verdict.at, verdict.by) == ("not authentic", row.at, row.by)
+    assert readings.verdicts_of(station, [bytes(10)], []) == {}
+
+
+def test_a_snapshot_of_pins_refuses_another_key_as_the_station_does(station: Station, board: Board) -> None:
+    pins = snapshot_trust(station).pins
+    pins.check(board.uuid, board.key.point)
+    pins.check(bytes(10), board.key.point)
+    with pytest.raises(KeyMismatchError) as refused:
+        pins.check(board.uuid, SoftwareKey(7).point)
+    with pytest.raises(KeyMismatchError) as by_station:
+        station.pins.check(board.uuid, SoftwareKey(7).point)
+    assert (refused.value.message, refused.value.hint) == (by_station.value.message, by_station.value.hint)
+
+
+@pytest.mark.parametrize("what", ["no datasheet", "no Security TEDS", "damaged", "unsigned", "by a stranger", "signed"])
+def test_only_what_this_station_trusts_is_a_bound_for_sequence_and_epoch(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    image, identity = station.datasheets.datasheet(board.uuid), cast(Any, object())
+    assert image is not None
+    unsigned = Board(uuid=board.uuid, key=board.key).state.blocks
+    stored = {
+        "no datasheet": None,
+        "no Security TEDS": Image(board.uuid, image.unsigned_blocks()),
+        "damaged": Image(board.uuid, {**image.blocks, SECURITY: frame(b"\xff\xff")}),
+        "unsigned": Image(board.uuid, dict(unsigned)),
+    }.get(what, image)
+    if what == "by a stranger":
+        monkeypatch.setattr(type(station.policy), "trusted_cas", lambda *_: [SoftwareKey(7).point])
+        monkeypatch.setattr(type(station.policy), "trusted_stations", lambda *_: [])
+    monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: stored)
+    found = freshness_floor_of(station, board.uuid, identity)
+    bound = (1, 1) if what == "signed" else (0, 0)
+    assert (found.identity, (found.sequence, found.key_epoch)) == (identity, bound)
+
+
+def test_a_reading_whose_key_another_node_signed_is_no_key_of_this_one(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = station.datasheets.reading(board.uuid)
+    assert row is not None
+    assert row.node_key_signature is not None
+    monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: None)
+    assert known_node_keys(station, board.uuid).key == board.key.point
+    other = node_key_message(bytes(10), board.key.point)
+    for key, signature, error in (
+        (board.key.point, board.key.sign(other), BadDataError),
+        (None, row.node_key_signature, NotFoundError),
+        (board.key.point, None, NotFoundError),
+    ):
+        forged = replace(row, node_key=key, node_key_signature=signature)
+        monkeypatch.setattr(type(station.datasheets), "reading", lambda *_, forged=forged: forged)
+        with pytest.raises(error) as refused:
+            known_node_keys(station, board.uuid)
+        assert board.uuid.hex() in str(refused.value)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -324,3 +327,49 @@ def test_a_clock_that_no_signature_can_hold_is_wrong(monkeypatch: pytest.MonkeyP
         return
     with pytest.raises(TedsProvisionError, match=r"^This machine's clock is wrong\.$"):
         signing._now()
+
+
+def test_a_signature_against_the_node_itself_is_made_in_its_session_under_its_lock(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course: list[Any] = []
+
+    @contextmanager
+    def met(_station: Station, links: LinkSettings, uuid: bytes, _reporter: Any) -> Iterator[str]:
+        course.append(("met", uuid, links))
+        yield "node"
+
+    @contextmanager
+    def locked(_own: Station, uuid: bytes) -> Iterator[None]:
+        course.append(("locked", uuid))
+        yield
+        course.append("free")
+
+    def sign_it(_station: Station, order: SignOrder, node: Any) -> str:
+        course.append((node, order.uuid, order.dry_run))
+        return "signed"
+
+    monkeypatch.setattr(signing, "meet", met)
+    monkeypatch.setattr(type(station), "node_lock", locked)
+    monkeypatch.setattr(signing, "sign_image", sign_it)
+    links, uuid = LinkSettings("nfc"), image.uuid
+    at = partial(signing.sign_at, station, links, uuid.hex(), SilentReporter())
+    assert at(read_node=True) == "signed"
+    assert course == [("met", uuid, links.after_agreeing()), ("locked", uuid), ("node", uuid, False), "free"]
+    course.clear()
+    assert at() == "signed"
+    assert course == [(None, uuid, False)], "the node is not met"
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_a_plan_of_a_signature_opens_no_session_that_would_settle_a_key(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch, dry_run: bool
+) -> None:
+    opened: list[Any] = []
+    found = SimpleNamespace(image=image, identity=SimpleNamespace(epoch=3, sequence=9))
+    monkeypatch.setattr(signing, "require_session", lambda *given: opened.append(given))
+    monkeypatch.setattr(signing, "take_snapshot", lambda _node: found)
+    node: Any = object()
+    present = signing._read_now(station, node, SignOrder(image.uuid, None, None, dry_run))
+    assert opened == ([] if dry_run else [(station, node)])
+    assert (present.epoch, present.sequence) == (3, 9)

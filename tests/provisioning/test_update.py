@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -9,19 +10,24 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import cbor2
 import pytest
+from smp.exceptions import SMPException
 
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
     FrozenError,
+    GarbledError,
     LinkClosedError,
+    LinkError,
     NodeRefusedError,
     NodeSilentError,
     NotAuthenticError,
+    NotFoundError,
+    NoUpdateError,
     PolicyError,
     RevertedError,
     StoreError,
@@ -452,6 +458,31 @@ def test_losses_count_from_the_last_piece_that_arrived(monkeypatch: pytest.Monke
     node: Any = SimpleNamespace(identity=SimpleNamespace(max_message=1000), is_alive=lambda: True, reopen=lambda: None)
     monkeypatch.setattr(image_manager, "_LOSSES", 3)
     assert ImageManager(node).upload(bytes(30), lambda done, of: None) == 30
+
+
+@pytest.mark.parametrize(("taken", "most", "good"), [(1, 3, True), (1, 4, False), (0, 2, True), (0, 3, False)])
+def test_only_a_piece_that_the_board_took_ends_the_count_of_losses(
+    monkeypatch: pytest.MonkeyPatch, taken: int, most: int, good: bool
+) -> None:
+    """One loss, what the board then has, and as many losses as ``most``, of which three in a row are borne."""
+    course: list[Any] = [None, (taken, 20), *[None] * most, (1, 30)]
+    shown: list[tuple[int, int]] = []
+
+    def once(self: ImageManager, octets: bytes) -> Iterator[tuple[int, int]]:
+        while course:
+            if (now := course.pop(0)) is None:
+                raise NodeSilentError("A frame is lost.")
+            yield now
+
+    monkeypatch.setattr(ImageManager, "_upload_once", once)
+    monkeypatch.setattr(image_manager, "_LOSSES", 3)
+    manager, _ = a_manager()
+    if good:
+        assert manager.upload(bytes(30), lambda done, of: shown.append((done, of))) == taken + 1
+        assert shown == [(20, 30), (30, 30)]
+    else:
+        with pytest.raises(NodeSilentError):
+            manager.upload(bytes(30), lambda done, of: None)
 
 
 # -- hostile boards and a hostile bus ----------------------------------------------------------------------------------
@@ -1266,3 +1297,222 @@ def test_a_board_is_looked_for_two_seconds_at_a_time_within_what_is_left(monkeyp
         with pytest.raises(PolicyError, match="unknown"), made._in_session(left):
             pass
     assert looked == [2.0, 0.5]
+
+
+# -- the image manager, without a board --------------------------------------------------------------------------------
+
+
+def a_manager(answers: Callable[[bytes], bytes] = lambda _packet: b"", *, alive: bool = True) -> tuple[Any, Any]:
+    """Return a manager, and the node that answers its packets."""
+    node: Any = SimpleNamespace(
+        identity=SimpleNamespace(max_message=1000),
+        contact=SimpleNamespace(link=object()),
+        is_alive=lambda: alive,
+        reopened=0,
+    )
+    node.reopen = lambda: setattr(node, "reopened", node.reopened + 1)
+    node.request = lambda command, _doing: answers(command.payload)
+    return ImageManager(node), node
+
+
+@pytest.mark.parametrize(
+    ("alive", "losses", "error"),
+    [
+        (True, [NodeSilentError("1")] * 3, None),
+        (True, [SessionLostError(NodeSilentError("1"))] * 3, None),
+        (True, [SessionLostError(NodeSilentError("of a session"))] * 4, "of a session"),
+        (True, [GarbledError("garbled")] * 4, "garbled"),
+        (False, [SessionLostError(NodeSilentError("closed"))], "closed"),
+    ],
+)
+def test_an_upload_goes_on_after_losses_in_shorter_packets_until_there_are_too_many(
+    monkeypatch: pytest.MonkeyPatch, alive: bool, losses: list[Exception], error: str | None
+) -> None:
+    left = list(losses)
+    manager, node = a_manager(alive=alive)
+    monkeypatch.setattr(image_manager, "_LOSSES", 3)
+    monkeypatch.setattr(image_manager, "_SMALLEST_PACKET", 200)
+    largest: list[int] = []
+
+    def once(octets: bytes) -> Iterator[tuple[int, int]]:
+        largest.append(manager._largest)
+        if left:
+            raise left.pop(0)
+        yield len(octets), len(octets)
+
+    manager._upload_once, first = once, manager._largest
+    if error is None:
+        assert manager.upload(bytes(30), lambda done, of: None) == 30
+        assert (largest, node.reopened) == ([first, first // 2, first // 4, 200], 3)
+        return
+    with pytest.raises(LinkError) as lost:
+        manager.upload(bytes(30), lambda done, of: None)
+    assert (lost.value.message, node.reopened) == (error, 3 if alive else 0)
+
+
+def test_only_octets_that_the_board_took_from_here_are_counted_as_sent() -> None:
+    """It has the first 300 of an earlier run, and a reply is lost later; length and digest go with the first piece."""
+    manager, _ = a_manager()
+    image, replies, asked = bytes(range(250)) * 4, [300, 700, 700, 1000], list[tuple[Any, ...]]()
+    course: list[str] = []
+    manager._room, manager._fit_buffer = lambda _offset, _more: 400, lambda: course.append("fit")
+
+    def ask(request: Any, _kind: Any, _doing: str) -> Any:
+        asked.append((request.off, request.data, request.len, request.sha))
+        return SimpleNamespace(off=replies.pop(0), match=None)
+
+    manager._ask = ask
+    assert list(manager._upload_once(image)) == [(0, 300), (400, 700), (0, 700), (300, 1000)]
+    assert asked == [
+        (0, image[:400], 1000, hashlib.sha256(image).digest()),
+        (300, image[300:700], None, None),
+        (700, image[700:], None, None),
+        (700, image[700:], None, None),
+    ]
+    assert course == ["fit"]
+
+
+@pytest.mark.parametrize(("size", "good"), [(4096, True), (300, True), (137, True), (136, False)])
+def test_packets_are_no_longer_than_the_board_and_its_messages_take(size: int, good: bool) -> None:
+    manager, _ = a_manager()
+    asked: list[str] = []
+
+    def ask(_request: Any, _kind: Any, doing: str) -> Any:
+        asked.append(doing)
+        return SimpleNamespace(buf_size=size)
+
+    manager._ask, most = ask, manager._largest
+    if not good:
+        with pytest.raises(NotAuthenticError, match="accepts packets of 136 octets only, too short for an image"):
+            manager._fit_buffer()
+        return
+    manager._fit_buffer()
+    manager._fit_buffer()
+    assert (manager._largest, asked) == (min(most, size), ["its packet size"])
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "why"),
+    [
+        (SMPException("bad"), NotAuthenticError, "it lacks what belongs there"),
+        (TypeError("bad"), NotAuthenticError, "it lacks what belongs there"),
+        (ValueError("bad"), NotAuthenticError, "it lacks what belongs there"),
+        (RuntimeError("a bug"), RuntimeError, "a bug"),
+    ],
+)
+def test_a_reply_that_smp_cannot_load_is_the_boards_fault_and_a_bug_is_none(
+    error: Exception, raised: type[Exception], why: str
+) -> None:
+    manager, _ = a_manager()
+    manager._exchange = lambda packet, _doing: decode_packet(packet).reply(cbor2.dumps({})).encode()
+
+    def loads(_octets: bytes) -> Any:
+        raise error
+
+    with pytest.raises(raised, match=why):
+        manager._ask(manager._os.ResetWriteRequest(), SimpleNamespace(loads=loads), "to restart")
+
+
+@pytest.mark.parametrize(
+    ("reasons", "at", "busy"),
+    [([Reason.BUSY, Reason.BUSY], 100.0, 2), ([Reason.NOT_PERMITTED], 100.0, None), ([Reason.BUSY], 1e9, None)],
+)
+def test_a_busy_image_manager_is_asked_again_for_a_while_and_another_refusal_counts(
+    monkeypatch: pytest.MonkeyPatch, reasons: list[Reason], at: float, busy: int | None
+) -> None:
+    left, pauses, moments = list(reasons), list[float](), [100.0]
+
+    def monotonic() -> float:
+        return moments.pop() if moments else at
+
+    def answer(_command: bytes) -> bytes:
+        if left:
+            raise NodeRefusedError("Refused.", reason=left.pop(0))
+        return b"done"
+
+    monkeypatch.setattr(image_manager, "time", SimpleNamespace(monotonic=monotonic, sleep=pauses.append))
+    manager, _ = a_manager(answer)
+    if busy is None:
+        with pytest.raises(NodeRefusedError):
+            manager._exchange(b"", "the image")
+        assert pauses == []
+    else:
+        assert (manager._exchange(b"", "the image"), len(pauses)) == (b"done", busy)
+
+
+def test_a_package_that_is_missing_is_named_with_its_installation() -> None:
+    with pytest.raises(NotFoundError, match="A firmware update needs the package smp") as refused:
+        image_manager._smp("nothing_of_that_name")
+    assert "update" in refused.value.hint
+
+
+# -- what an update says when it cannot be ----------------------------------------------------------------------------
+
+
+def test_the_plan_of_an_update_that_is_refused_raises_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    none: Any = None
+    board = update.BoardUpdate(bytes(10), "refused", None, 0, 0.0, DowngradeError("It is older."))
+    monkeypatch.setattr(update, "plan_or_refusal", lambda *_: board)
+    with pytest.raises(DowngradeError, match="It is older"):
+        plan_update(none, none, bytes(10), none, SilentReporter())
+
+
+def test_a_board_that_reports_no_firmware_or_does_not_manage_it_takes_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    none: Any = None
+    for report, why, hint in (
+        (
+            None,
+            "does not report its firmware, so it takes none over this link.",
+            "Program it once by its",
+        ),
+        (replace(reported(), flags=FirmwareFlag(0)), "takes no firmware over its session", "It needs MCUboot with"),
+    ):
+        monkeypatch.setattr(update, "read_about", lambda _node, report=report: report)
+        with pytest.raises(NoUpdateError, match=why) as refused:
+            an_update()._look(none)
+        assert refused.value.hint.startswith(hint)
+
+
+def test_an_image_that_the_board_does_not_show_after_the_upload_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, course, none = an_update(), list[str](), cast(Any, None)
+    shown: list[list[Any]] = []
+
+    def upload(octets: bytes, _progress: Any) -> int:
+        course.append("upload")
+        return len(octets)
+
+    manager: Any = SimpleNamespace(
+        images=lambda: shown.pop(0), upload=upload, start_next=lambda digest: course.append(digest.hex()[:4])
+    )
+    other = BoardImage(b"other", running=False, confirmed=False, pending=False)
+    ours = BoardImage(made._digest, running=False, confirmed=False, pending=False)
+    running = replace(ours, running=True)
+    for images, done in (
+        ([[other], [other]], None),
+        ([[other], [running]], None),
+        ([[other], [ours]], ["upload", made._digest.hex()[:4]]),
+        ([[other, ours]], [made._digest.hex()[:4]]),
+    ):
+        shown[:], course[:] = images, []
+        if done is None:
+            with pytest.raises(NotAuthenticError, match="does not show the image that was sent"):
+                made._upload(none, manager)
+            assert course == ["upload"]
+        else:
+            made._upload(none, manager)
+            assert course == done
+
+
+def test_a_board_that_does_not_come_back_from_its_trial_is_lost_after_the_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = an_update(wait=2.5)
+    board = _Returns(monkeypatch, made, *[NodeSilentError("It is silent.")] * 9)
+    moments = [100.0, 100.5, 101.9, 102.49, 102.5, 103.0]
+    left: list[float] = []
+    session = made._in_session
+    made._in_session = lambda seconds: (left.append(round(seconds, 2)), session(seconds))[1]
+    monkeypatch.setattr(update, "time", SimpleNamespace(monotonic=lambda: moments.pop(0), sleep=lambda _seconds: None))
+    node: Any = SimpleNamespace(open_counter=bytes(8), contact=SimpleNamespace(link=SimpleNamespace(close=board.close)))
+    with pytest.raises(BoardLostError, match=r"did not answer within 2\.5 s after its restart") as lost:
+        made._revert(node, PolicyError("It is harmful."))
+    assert left == [2.0, 0.6, 0.01], "to the end of the wait and no longer"
+    assert lost.value.hint.startswith("Switch it off and on: it then runs its old firmware.")

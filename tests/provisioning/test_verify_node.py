@@ -17,6 +17,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.verify_node import open_or_say_why, verify_at, verify_at_node
 from teds_provision.station.station import Station
+from teds_provision.teds.image import Image
 from tests.bench import Board, make_station, talk
 
 from .test_provision import run
@@ -111,3 +112,27 @@ def test_a_plain_answer_changes_no_fact_of_a_session_and_is_no_session_later(
     assert later is not None
     (session,) = [check for check in later.verified.checks if check.name == "session"]
     assert session.why == "its datasheet was last read outside a session"
+
+
+def test_a_refusal_in_a_session_is_an_error_and_one_outside_of_it_a_reason(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> Any:
+        raise NodeRefusedError(f"{HEARD}it is busy.", reason=Reason.BUSY)
+
+    monkeypatch.setattr(verify_node, "session_if_keyed", refuse)
+    node: Any = SimpleNamespace(uuid=bytes(10), sealed=False)
+    assert "busy" in open_or_say_why(station, node)
+    node.sealed = True
+    with pytest.raises(NodeRefusedError):
+        open_or_say_why(station, node)
+
+
+def test_an_image_file_is_verified_without_a_node(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = Image(bytes(10), {})
+    monkeypatch.setattr(verify_node, "node_or_image", lambda _station, what, *, is_node: image if not is_node else what)
+    monkeypatch.setattr(verify_node, "verify_image_alone", lambda *given: given)
+    found = verify_at(station, LinkSettings(), "image.json", SilentReporter(), accept_calibration="it is so")
+    assert found == (station, image, "it is so")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,11 +20,14 @@ from teds_provision.errors import (
     NotFoundError,
     PolicyError,
 )
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning import write as writing
 from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.conversation import SessionLostError
+from teds_provision.provisioning.operator import Operator
+from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.sign import SignOrder, sign_image
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
@@ -347,3 +353,55 @@ def test_a_write_that_is_cut_short_starts_over_or_was_done(
             writing._commit(station, node, image, has, None)
         assert raised.value is error
     assert (node.skips, node.opened, node.ends) == (skips, opened, [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "known", "retyped", "jump", "asked"),
+    [
+        (("in N",), False, False, False, ["retype in N"]),
+        (("in N",), True, False, False, []),
+        (("in N",), False, True, False, []),
+        ((), False, False, False, []),
+        ((), False, False, True, ["jump"]),
+    ],
+)
+def test_what_a_person_is_asked_before_an_image_is_written(
+    station: Station,
+    image: Image,
+    monkeypatch: pytest.MonkeyPatch,
+    changes: tuple[str, ...],
+    known: bool,
+    retyped: bool,
+    jump: bool,
+    asked: list[str],
+) -> None:
+    course, visit = list[str](), SimpleNamespace(node=SimpleNamespace(), who=None)
+
+    class Person(Operator):
+        def retype(self, uuid: bytes, differences: tuple[str, ...]) -> None:
+            course.append(f"retype {differences[0]}")
+
+        def jump(self, question: str) -> None:
+            assert question == "This uses up the node's sequence numbers up to that point, permanently. Write it?"
+            course.append("jump")
+
+    def written(*_: Any, **how: Any) -> Any:
+        assert (how["jump"], how["facts"]) == (jump, {"profile": "gripper"})
+        course.append("written")
+        raise PolicyError("far enough")
+
+    @contextmanager
+    def at(*_: Any, **__: Any) -> Iterator[Any]:
+        yield visit
+
+    monkeypatch.setattr(writing, "_wanted", lambda *_: (image, {"profile": "gripper"}))
+    monkeypatch.setattr(writing, "at_node", at)
+    monkeypatch.setattr(writing, "require_session", lambda *_: course.append("session"))
+    monkeypatch.setattr(writing, "differences", lambda *_: changes)
+    monkeypatch.setattr(writing, "shown_by", lambda *_: {})
+    monkeypatch.setattr(writing, "is_remembered", lambda *_, factory: known and not factory)
+    monkeypatch.setattr(writing, "write", written)
+    how: dict[str, Any] = {"file": None, "operator": Person(), "jump": jump, "retyped": retyped}
+    with pytest.raises(PolicyError, match="far enough"):
+        writing.write_at(station, LinkSettings(), image.uuid.hex(), SilentReporter(), **how)
+    assert course == (["jump", "session", "written"] if jump else ["session", *asked, "written"])
