@@ -329,7 +329,9 @@ static void take_physical(teds_node *node, const teds_can_frame *frame, uint64_t
     }
     line = find_line(node, source, OF_A_REPLY, tick);
     if (line == NULL) {
-        turn_station_away(node, frame, source);
+        if (own == node->can.address) { /* otherwise the node has moved, and the old address does not answer */
+            turn_station_away(node, frame, source);
+        }
         return;
     }
     switch (frame->data[0] >> 4) {

@@ -355,7 +355,7 @@ static int run_sealed(teds_node *node, const teds_command *command, teds_origin 
     /* expired leases end first, so that this command cannot renew them */
     (void)teds_operation_poll(node, teds_now(node));
 #endif
-    outcome = teds_take_sealed(node, origin->link, origin->arrival, command->payload, command->length, inner, &taken);
+    outcome = teds_take_sealed(node, origin->link, command->payload, command->length, inner, &taken);
     if (outcome) {
         return outcome;
     }

@@ -99,21 +99,20 @@ static teds_session *make_session_room(teds_node *node, teds_link link)
 }
 
 /* Begin the session of a half-open Open at its first good message; NULL if there is no room. */
-static teds_session *begin_session(teds_node *node, teds_link link, uint8_t kind, teds_half_open *half)
+static teds_session *begin_session(teds_node *node, teds_link link, teds_half_open *half)
 {
     teds_session *session = make_session_room(node, link);
     if (session != NULL) {
         teds_session_end(node, session);
         session->used = true;
         session->link = link;
-        session->kind = kind;
         session->keys = half->keys;
     }
     teds_wipe(half, sizeof *half);
     return session;
 }
 
-int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
+int teds_take_sealed(teds_node *node, teds_link link, const uint8_t *payload,
                      size_t length, uint8_t *plain, teds_taken *taken)
 {
     const int refused = teds_unseal(node, link, payload, length, plain, taken);
@@ -121,7 +120,7 @@ int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arriva
         return refused;
     }
     if (taken->half != NULL) {
-        taken->session = begin_session(node, link, arrival->kind, taken->half);
+        taken->session = begin_session(node, link, taken->half);
     }
     if (taken->session != NULL) {
         taken->session->counter = taken->counter;

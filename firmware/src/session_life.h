@@ -9,7 +9,7 @@
 /* Decrypt a command. If it is the first message of a half-open Open, that becomes a session: in its link's place, a
  * free one, or that of the session without claims that was silent longest. taken->session is NULL if there is no room.
  * */
-int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
+int teds_take_sealed(teds_node *node, teds_link link, const uint8_t *payload,
                      size_t length, uint8_t *plain, teds_taken *taken);
 
 /* End a session and what it holds; does nothing for NULL or an unused one. */

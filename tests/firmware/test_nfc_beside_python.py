@@ -18,12 +18,14 @@ from teds_provision.protocol.messages.frames import (
     Command,
     Function,
     Reason,
+    decode_reply,
     refusal,
     security_command,
     update_teds,
     write_teds,
 )
 from teds_provision.protocol.operation.commands import PowerReply
+from teds_provision.protocol.operation.stream_commands import CLOCK, ClockReply
 from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.firmware.desk import CDesk
 from tests.firmware.memory_node import MemoryNode
@@ -342,6 +344,111 @@ def test_what_a_payload_record_may_not_be(taps: Callable[[int, int], Taps]) -> N
     assert payload("01 01 0009 001a 0000", b"\1\0\x17" + reply[-23:]) == reply[-38:]
 
 
+SELECTED, ERROR, GARBLED = (bytes.fromhex(f"d102015465{status}") for status in ("00", "01", "80"))
+
+
+def test_a_reader_that_activates_the_tag_anew_selects_the_service_anew(taps: Callable[[int, int], Taps]) -> None:
+    """Its field was never gone: it sends RATS once more, and sees the initial message."""
+    reader = taps(4, 499)
+    piece = message.encode([tnep.payload_record(payload("01 00 0009 0006 0000", IDENTIFY))])
+    assert reader.write(message.encode([tnep.select(tnep.SERVICE)])) == SELECTED
+    assert len(reader.write(piece)) > 60
+    reader.tag.activated()
+    reader.c.nfc_field(True)
+    assert reader.tag.ready(60)
+    while not reader.mailbox.shown.empty():
+        assert reader.mailbox.shown.get() == reader.c.nfc_message()
+    assert reader.write(piece) == ERROR
+
+
+def test_a_message_that_is_not_answered_yet_goes_with_a_new_activation() -> None:
+    node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
+    node.has_nfc()
+    assert node.start() == 0
+    rats, select = bytes.fromhex("e080"), message.encode([tnep.select(tnep.SERVICE)])
+    assert node.nfc_frame(rats) == ATS
+    for block in ("0200a4040007d276000085010100", "0300a4000c02e104"):
+        assert node.nfc_frame(bytes.fromhex(block)) == bytes.fromhex(block[:2] + "9000")
+    initial = node.nfc_message()
+    update = b"\0\xd6\0\0" + bytes((2 + len(select),)) + len(select).to_bytes(2, "big") + select
+    assert node.nfc_frame(b"\x02" + update) == b"\x02\x90\x00"
+    assert node.nfc_frame(rats) == ATS
+    node.poll()
+    assert node.nfc_message() == initial
+    assert node.nfc_frame(b"\x02\0\xb0\0\0\2") == b"\x02\x69\x86", "nor is the application selected any more"
+    node.close()
+
+
+_TS, _TIM = tnep.select(tnep.SERVICE), tnep.payload_record(b"")
+_PIECE = payload("01 00 0009 0006 0000", IDENTIFY)
+
+
+@pytest.mark.parametrize(
+    ("records", "shown"),
+    [
+        ([NdefRecord(WELL_KNOWN, b"Xs", _TS.payload)], ERROR),
+        ([NdefRecord(WELL_KNOWN, b"ts", _TS.payload)], ERROR),
+        ([NdefRecord(WELL_KNOWN, b"Tx", _TS.payload)], ERROR),
+        ([NdefRecord(WELL_KNOWN, b"Tss", _TS.payload)], ERROR),
+        ([NdefRecord(WELL_KNOWN, b"T", _TS.payload)], ERROR),
+        ([NdefRecord(EXTERNAL, b"Ts", _TS.payload)], ERROR),
+        ([_TS, NdefRecord(WELL_KNOWN, b"Ts", tnep.select(b"urn:nfc:xsn:other:one").payload)], SELECTED),
+        ([_TS, NdefRecord(EXTERNAL, b"x" + _TIM.type[1:], _PIECE)], SELECTED),
+    ],
+    ids=["first letter", "case", "last letter", "longer", "shorter", "external", "the first counts", "beside"],
+)
+def test_a_selection_is_a_ts_record_and_no_other(
+    taps: Callable[[int, int], Taps], records: list[NdefRecord], shown: bytes
+) -> None:
+    assert taps(5, 499).write(message.encode(records)) == shown
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "ours"),
+    [
+        (_TIM.type, EXTERNAL, True),
+        (_TIM.type.upper(), EXTERNAL, True),
+        (b"T" + _TIM.type[1:], EXTERNAL, True),
+        (_TIM.type[:-1] + b"M", EXTERNAL, True),
+        (b"s" + _TIM.type[1:], EXTERNAL, False),
+        (_TIM.type[:-1] + b"n", EXTERNAL, False),
+        (_TIM.type[:-1], EXTERNAL, False),
+        (_TIM.type + b"m", EXTERNAL, False),
+        (_TIM.type, WELL_KNOWN, False),
+    ],
+)
+def test_a_request_lies_in_a_record_of_this_external_type(
+    taps: Callable[[int, int], Taps], name: bytes, kind: int, ours: bool
+) -> None:
+    """External types are compared without case (NFC Forum RTD)."""
+    reader = taps(5, 499)
+    assert reader.write(message.encode([_TS])) == SELECTED
+    shown = reader.write(message.encode([NdefRecord(kind, name, _PIECE)]))
+    assert len(shown) > 60 if ours else shown == ERROR
+
+
+@pytest.mark.parametrize(
+    "octets",
+    [
+        "d1",
+        "d102",
+        "91 02 00 54 73 11",  # a record that begins the message, then an octet of the next one
+        "91 02 00 54 73 11 00 00 11",
+        "91 02 00 54 73 11 00 00",  # whole records, none of which ends the message
+        "d1 02 05 54 73 00",
+        "d9 02 00 54 73",
+        "d9 02 00 01 54 73",
+        "c1 02 00 00 00 54 73",
+        "51 02 01 54 73 00",  # does not begin a message
+        "91 02 01 54 73 00 d1 00 00",  # begins it again
+    ],
+)
+def test_a_message_that_is_cut_off_is_garbled(taps: Callable[[int, int], Taps], octets: str) -> None:
+    reader = taps(6, 499)
+    assert reader.write(message.encode([_TS])) == SELECTED
+    assert reader.write(bytes.fromhex(octets)) == GARBLED
+
+
 def test_half_a_request_and_a_reply_go_with_the_field(taps: Callable[[int, int], Taps]) -> None:
     reader = taps(4, 499)
     select = message.encode([tnep.select(tnep.SERVICE)])
@@ -427,3 +534,28 @@ def test_both_tags_answer_a_readers_frames_alike(fsdi: int) -> None:
                 node.poll()
                 memory.put(node.nfc_message())
         node.close()
+
+
+def test_a_clock_over_nfc_was_received_when_its_message_was_whole_and_sent_when_it_was_answered(keyed: CDesk) -> None:
+    """The reader writes it, and the node's loop takes it up a quarter of a second later."""
+    keyed.node.add_channel(1, 0, 2)
+    keyed.restart()
+    keyed.open()
+    session, node = keyed.session, keyed.node
+    assert session is not None
+    frame = session.seal(CLOCK).encode()
+    piece = message.encode([tnep.payload_record(Piece(9, len(frame), 0, frame).encode())])
+    node.nfc_write(message.encode([tnep.select(tnep.SERVICE)]))
+    node.nfc_frame(bytes.fromhex("e080"))
+    for number, apdu in enumerate(("00a4040007d276000085010100", "00a4000c02e104")):
+        assert node.nfc_frame(bytes((0x02 | number,)) + bytes.fromhex(apdu)) == bytes((0x02 | number, 0x90, 0x00))
+    node.nfc_write(message.encode([tnep.select(tnep.SERVICE)]))
+    keyed.now = 7.0
+    update = b"\0\xd6\0\0" + bytes((2 + len(piece),)) + len(piece).to_bytes(2, "big") + piece
+    assert node.nfc_frame(b"\x02" + update) == b"\x02\x90\x00"
+    keyed.now = 7.25
+    node.poll()
+    (_, answer) = message.decode(node.nfc_message())
+    inner = session.unseal(decode_reply(Piece.decode(answer.payload).body).payload)
+    told = ClockReply.decode(inner.payload)
+    assert (told.received, told.sent) == (7_000_000_000, 7_250_000_000)

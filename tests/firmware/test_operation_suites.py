@@ -242,6 +242,89 @@ def test_every_end_of_a_claim_is_safe_and_leaves_nothing(end: str) -> None:
         assert bench.operation().channels[4] == (ChannelState.ACTUATOR | ChannelState.SAFE | stopped, 0)
 
 
+@pytest.mark.parametrize("number", [1, 8])
+@pytest.mark.parametrize("end", ["idle", "all idle", "dead-man", "lease", "trigger", "by hand", "power"])
+def test_an_actuator_is_served_alike_in_the_first_place_of_the_table_and_in_the_last(number: int, end: str) -> None:
+    """Eight channels, which is all that a build takes by default; actuators are the first and the last."""
+    facts = {each: ChannelHardware(ChannelKind.SENSOR, 2) for each in range(2, 8)}
+    facts |= {each: ChannelHardware(ChannelKind.ACTUATOR, 2, halt=1) for each in (1, 8)}
+    bench = CBench(teds={(each, 3): channel_teds(own) for each, own in facts.items()})
+    bench.hardware.channels = facts
+    bench.hardware.points = dict.fromkeys((1, 8), VALUE)
+    bench.restart()
+    assert safe(bench, 1)
+    assert safe(bench, 8)
+    other = 9 - number
+    bench.open().operate(number, lease=5, dead_man=10_000 if end == "lease" else 2000)
+    assert bench.send(write_data_set(number, VALUE)).ok
+    states = bench.operation().channels
+    assert states[number] == (ChannelState.ACTUATOR | ChannelState.CLAIMED_HERE, 0xF1)
+    assert states[other] == (ChannelState.ACTUATOR | ChannelState.SAFE, 0)
+    assert bench.reason(write_data_set(other, VALUE)) == Reason.WRONG_STATE
+    assert node(bench).actuator_claimed()
+    token = test_triggers.armed(bench, Action.STOP)
+    bench.hardware.log.clear()
+    now = bench.hardware.tick
+    match end:
+        case "idle":
+            bench.idle(number)
+        case "all idle":
+            bench.idle(0)
+        case "dead-man" | "lease":
+            due = now + (2 if end == "dead-man" else 5) * SECOND
+            bench.until(due - 1)
+            assert not safe(bench, number)
+            bench.until(due)
+        case "trigger":
+            bench.tim.trigger("can:f1", token.octets, now)
+        case "by hand":
+            node(bench).reset_by_hand()
+        case "power":
+            bench.hardware.charge = PowerReply(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
+            node(bench).poll()
+    assert safe(bench, number)
+    assert ("safe", number) in bench.hardware.log
+    assert not node(bench).actuator_claimed()
+    if end != "by hand":
+        stopped = ChannelState.STOPPED if end in ("dead-man", "trigger") else 0
+        assert bench.operation().channels[number] == (ChannelState.ACTUATOR | ChannelState.SAFE | stopped, 0)
+
+
+def test_two_event_sensors_have_rings_of_their_own() -> None:
+    """A sensor and an actuator between them; what the ring of one loses is not missing from the other."""
+    facts = {
+        1: ChannelHardware(ChannelKind.EVENT_SENSOR, 2),
+        2: ChannelHardware(ChannelKind.SENSOR, 2),
+        3: ChannelHardware(ChannelKind.ACTUATOR, 2, halt=1),
+        4: ChannelHardware(ChannelKind.EVENT_SENSOR, 2),
+    }
+    bench = CBench(teds={(each, 3): channel_teds(own) for each, own in facts.items()})
+    bench.hardware.channels = facts
+    bench.restart()
+    bench.open().operate(0)
+    start = bench.hardware.tick + 100 * MS
+    streams = {
+        channel: Consumer(bench, stream, (channel,), kind=StreamKind.EVENT, n=1, period=MS, start=start)
+        for stream, channel in enumerate((1, 4))
+    }
+    bench.until(start)
+    for at in range(7):  # a ring keeps four
+        node(bench).interrupt(4, start + at * MS, bytes((4, at)))
+    node(bench).interrupt(1, start + 2 * MS, b"\x01\x00")
+    for number in (2, 3):
+        node(bench).interrupt(number, start + 3 * MS, b"\xff\xff")  # they are no event sensors
+    bench.hardware.tick = start + 8 * MS
+    bench.until(start + 10 * MS)
+    seen = {channel: [(m.counter, m.data.hex()) for m in stream.messages()] for channel, stream in streams.items()}
+    assert seen == {1: [(0, "0100")], 4: [(3, "0403")]}, "of those that wait the newest leaves"
+    for channel in (4, 1):
+        node(bench).interrupt(channel, bench.hardware.tick, bytes((channel, 9)))
+        bench.later(10 * MS)
+    seen = {channel: [(m.counter, m.data.hex()) for m in stream.messages()] for channel, stream in streams.items()}
+    assert seen == {1: [(1, "0109")], 4: [(7, "0409")]}
+    assert [stream.stop() for stream in streams.values()] == [2, 8]
+
+
 def test_the_hardware_timer_is_armed_by_operate_and_kicked_by_good_values_alone() -> None:
     bench = CBench()
     bench.open()

@@ -79,8 +79,15 @@ def test_about_is_answered_anew_each_time(stations: Stations) -> None:
 
 @pytest.mark.parametrize(
     "question",
-    ["000080070000", "0000800b0000", "000101010001 0c", "000101020005 0c00000000"],
-    ids=["Identify", "List", "Query", "Read"],
+    [
+        "000080070000",
+        "0000800b0000",
+        "000101010001 0c",
+        "000101020005 0c00000000",
+        "000001010001 80",
+        "000001020005 80 00000000",
+    ],
+    ids=["Identify", "List", "Query", "Read", "Query of channel 0", "Read of channel 0"],
 )
 def test_a_question_is_answered_anew_each_time(question: str) -> None:
     desk = CDesk()

@@ -208,6 +208,7 @@ def test_staging_that_was_not_touched_for_60_seconds_gives_way_to_a_write(
     if reply.ok:
         assert two.by_nfc(update_teds(1, 12)) == BUSY, "what it had is gone"
         assert two.by_can(update_teds(0, 1)).ok
+        assert two.by_can(update_teds(1, 12)) == two.by_can(query_teds(1, 12)), "nor is it the other one's"
 
 
 def test_a_write_that_is_refused_makes_nothing_give_way(two: TwoSessions) -> None:

@@ -49,7 +49,6 @@ typedef struct teds_keys {
 typedef struct teds_session {
     bool used;
     teds_link link;
-    uint8_t kind;
     uint32_t counter;
     uint64_t good_at;
     teds_keys keys;

@@ -777,6 +777,33 @@ static void the_end_of_a_session_is_due(void)
     memory_free(board);
 }
 
+/* Of a half-open Open and of a Request nothing lives longer than its minute, in memory neither. */
+static void what_waits_for_its_station_is_wiped_after_a_minute(void)
+{
+    static const teds_half_open no_open;
+    static const teds_pending no_request;
+    memory_board *board = fresh();
+    teds_half_open *half = &board->node.half_open[TEDS_SESSIONS - 1];
+    teds_pending *pending = &board->node.pending;
+    memory_at(board, now);
+    half->used = pending->used = true;
+    half->link = pending->link = 0xF1;
+    half->until = now + 60000 * MS;
+    pending->until = now + 60001 * MS;
+    memset(&half->keys, 0x55, sizeof half->keys);
+    memset(&pending->agreed, 0x55, sizeof pending->agreed);
+    CHECK(memory_poll(board) == now + 60000 * MS && half->used, "the end of the Open is due");
+    now += 60000 * MS;
+    memory_at(board, now);
+    CHECK(memory_poll(board) == now + MS && pending->used, "then that of the Request");
+    CHECK(memcmp(half, &no_open, sizeof no_open) == 0, "nothing of the Open");
+    now += MS;
+    memory_at(board, now);
+    CHECK(memory_poll(board) == UINT64_MAX, "nothing is due");
+    CHECK(memcmp(pending, &no_request, sizeof no_request) == 0, "nothing of the Request");
+    memory_free(board);
+}
+
 /* One spare line is that of a long request that comes in, the other's answer has just begun: a station without a line is
  * refused, not ignored. */
 static void a_station_without_a_line_is_refused(void)
@@ -908,6 +935,34 @@ static void who_asks_on_after_a_move_asks_nobody(void)
     in(board, TO_NODE, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
     CHECK(silent(board), "nobody");
     CHECK(address_of(board) == 0x55, "it is at %02x", address_of(board));
+    memory_free(board);
+}
+
+/* The same, and another station takes the line whose reply nobody took up: it is not answered at the old address. */
+static void who_takes_the_line_of_a_move_asks_nobody(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    has_session(board, 0, 0xF1);
+    has_session(board, 1, 0xF2);
+    CHECK(is_answered(board, 0xF1) && is_answered(board, 0xF2), "their lines");
+    in(board, TO_NODE + 2, "\x10\x0c\x05\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "a long question");
+    in(board, TO_NODE + 2, "\x21\x05\x80\x00\x00\x00\x00\xcc", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "its answer begins");
+    board->node.can.moves_to = 0x55; /* as if it were that of a sealed 128.10 whose session has ended since */
+    board->node.can.moves_link = 0xF3;
+    in(board, TO_NODE + 3, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "another's long question comes in");
+    now += 99 * MS;
+    in(board, TO_NODE + 4, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF500u | OWN) && data[5] == 17, "it may yet be taken up");
+    CHECK(address_of(board) == OWN, "so the node stays");
+    now += MS;
+    in(board, TO_NODE + 4, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(address_of(board) == 0x55, "it has moved, to %02x", address_of(board));
+    CHECK(silent(board), "nobody answers for the old address");
     memory_free(board);
 }
 
@@ -1138,12 +1193,14 @@ int main(void)
     what_strangers_ask_takes_no_place_of_a_session();
     what_waits_to_leave_is_due_now();
     the_end_of_a_session_is_due();
+    what_waits_for_its_station_is_wiped_after_a_minute();
     a_station_without_a_line_is_refused();
     one_station_does_not_hold_the_place_of_long_requests();
     a_reply_that_is_another_link_s_is_nobodys();
     an_answer_to_everyone_is_of_one_moment();
     everyone_waits_for_a_station_s_own_answer();
     who_asks_on_after_a_move_asks_nobody();
+    who_takes_the_line_of_a_move_asks_nobody();
     a_move_waits_for_its_own_reply();
     a_chip_without_randomness_waits_by_its_uuid();
     forged_announces_move_a_node_less_and_less();
