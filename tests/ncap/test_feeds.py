@@ -45,7 +45,8 @@ def test_a_transducer_has_one_simulation_and_the_end_of_an_earlier_one_is_not_th
 ) -> None:
     one, first, second = bench.made(ONE, "hand", tmp_path), Feed("page", lambda: None), Feed("api:sim", lambda: None)
     bench.virtuals.begin_feed(one, first)
-    first.lines, first.skipped = 7, 2
+    first.lines, first.skipped, first.since = 7, 2, 1000.5
+    assert one.as_json()["simulation"] == {"by": "page", "since": 1000.5, "lines": 7, "skipped": 2}
     with pytest.raises(NodeBusyError, match="already fed by page"):
         bench.virtuals.begin_feed(one, second)
     bench.virtuals.end_feed(one, first)
@@ -54,6 +55,7 @@ def test_a_transducer_has_one_simulation_and_the_end_of_an_earlier_one_is_not_th
     assert one.feed is second
     bench.virtuals.end_feed(one, second)
     assert one.feed is None
+    assert one.as_json()["simulation"] is None
     assert bench.events == ["fed", "not fed", "fed", "not fed", "not fed"]
     begun, ended = ("virtual", bytes.fromhex(ONE), "simulation connected"), ("virtual", bytes.fromhex(ONE))
     assert bench.log[0] == (*begun, {"by": "page"})

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import NodeBusyError, NoNodeError
+from teds_provision.errors import InternalError, NodeBusyError, NodeSilentError, NoNodeError, PolicyError
+from teds_provision.ncap.nodes import node_jobs
 from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, NodeLocks
+from teds_provision.provisioning.conversation import SessionLostError
 from tests.pace import PATIENCE, until
 
 NODE = "ab" * 10
@@ -110,6 +113,51 @@ def test_a_node_that_is_not_tapped_in_time_is_reported() -> None:
     with pytest.raises(NoNodeError, match="was not placed on a reader"):
         jobs.with_node(NODE, "write", lambda _node: None, wait=0.0)
     assert not jobs._waiting
+
+
+@pytest.mark.parametrize("on_a_bus", [True, False])
+def test_who_asked_hears_why_the_session_was_lost_or_what_the_work_refused(
+    on_a_bus: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none: Any = None
+    node: Any = SimpleNamespace(tapped=True, uuid=bytes.fromhex(NODE))
+    found: Any = SimpleNamespace(find=lambda _uuid: node)
+    directory: Any = SimpleNamespace(seen=lambda _uuid: SimpleNamespace(present=on_a_bus, place="can:x"))
+    many: Any = SimpleNamespace(capabilities=SimpleNamespace(many=True))
+    jobs = NodeJobs(directory, NodeLocks(), lambda _place: many if on_a_bus else none)
+    monkeypatch.setattr(jobs, "_find", lambda _port, _uuid: found)
+    monkeypatch.setattr(node_jobs, "Conversation", lambda _contact, notice: nullcontext(node))
+    cause = NodeSilentError("The node does not answer.")
+    for raised, heard in ((SessionLostError(cause), cause), (refusal := PolicyError("No."), refusal)):
+
+        def work(_node: Any, raised: Exception = raised) -> None:
+            raise raised
+
+        wait_for = jobs.wait_for
+
+        def tapped_at_once(*request: Any, wait_for: Any = wait_for) -> NodeJob[Any]:
+            job = wait_for(*request)
+            jobs.serve(node)
+            return cast("NodeJob[Any]", job)
+
+        monkeypatch.setattr(jobs, "wait_for", tapped_at_once)
+        with pytest.raises(type(heard)) as refused:
+            jobs.with_node(NODE, "write", work, wait=PATIENCE)
+        assert refused.value is heard
+        monkeypatch.setattr(jobs, "wait_for", wait_for)
+    assert jobs.with_node(NODE, "write", lambda given: given is node, wait=PATIENCE) if on_a_bus else True
+
+
+def test_a_bug_of_the_work_is_an_error_for_who_asked_and_shown_in_the_log() -> None:
+    none: Any = None
+    tapped: Any = SimpleNamespace(tapped=True, uuid=bytes.fromhex(NODE))
+    jobs = NodeJobs(none, none, none)
+    job = jobs.wait_for(NODE, "write", lambda _node: 1 // 0, 60.0)
+    with pytest.raises(ZeroDivisionError):
+        jobs.serve(tapped)
+    assert job.done.is_set()
+    assert isinstance(job.error, InternalError)
+    assert job.error.message == "Unexpected ZeroDivisionError."
 
 
 def test_a_node_that_a_measurement_gave_back_is_frozen_no_more() -> None:

@@ -199,7 +199,17 @@ def test_a_curve_is_drawn_to_its_last_point(monkeypatch: pytest.MonkeyPatch) -> 
     assert (curve["channel"], curve["y_unit"]) == (7, "mm")
     assert (points[0], points[1], points[-1]) == ([0.0, 0.0], [10.0, 10.0], [999.0, 999.0]), "5 has no value"
     assert len(points) == 200
-    channel.actuator = True
+    calibration.inputs = [1, 2]
+    assert curves({}) == [], "of two inputs"
+    calibration.inputs, channel.calibration = [1], None
+    assert curves({}) == [], "the channel gives it without one"
+    channel.calibration, channel.actuator = object(), True
+    assert curves({}) == [], "of an actuator"
+    channel.actuator, sheet.channel = False, lambda _number: None
+    assert curves({}) == [], "of no channel"
+    sheet.channel = lambda _number: channel
+    assert len(curves({})) == 1
+    monkeypatch.setattr(sheets, "is_finite", lambda _calibration: False)
     assert curves({}) == []
 
 

@@ -516,6 +516,20 @@ def test_images_lie_in_a_folder_of_this_user_alone(tmp_path: Path, bench: Bench)
     assert list((tmp_path / "home" / "updates").iterdir()) == []
 
 
+def test_a_state_that_cannot_be_kept_ends_no_update_and_is_in_the_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, action = UpdateFolder(bench.updates._station.home), bench.action(BoardRow(NODE))
+    folder.keep_new(action, b"image")
+
+    def full(*_words: Any) -> None:
+        raise StoreError("The disk is full.")
+
+    monkeypatch.setattr(update_actions, "write_whole", full)
+    folder.keep(action)
+    assert caplog.messages == ["How the update goes cannot be kept: The disk is full."]
+
+
 def test_a_record_that_is_none_is_left_out_and_what_is_kept_comes_back_whole(bench: Bench) -> None:
     home = bench.updates._station.home
     folder = UpdateFolder(home)

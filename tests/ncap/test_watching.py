@@ -28,7 +28,7 @@ from teds_provision.ncap.running_measurement import RunningMeasurement
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.store.records import KeptMeasurement
-from tests.bench import MemoryLink, contact, make_station
+from tests.bench import MemoryLink, contact, copied_station, make_station
 from tests.pace import until
 from tests.provisioning.test_firmware import FirmwareBoard
 
@@ -56,6 +56,30 @@ def test_the_firmware_of_a_board_without_a_key_here_is_shown_as_unverified_and_n
     directory = NodeDirectory(station, NoListeners())  # type: ignore[arg-type]
     directory.note(stranger.uuid.hex(), "verified", firmware=found.firmware)
     assert directory.node(stranger.uuid.hex())["firmware"] == found.firmware
+    station.close()
+
+
+def test_channels_are_shown_anew_in_the_units_that_their_profiles_name_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = copied_station(tmp_path / "home")
+    directory = NodeDirectory(station, NoListeners())  # type: ignore[arg-type]
+    nodes = {"aa": "arm", "bb": "finger", "cc": "arm"}
+    monkeypatch.setattr(directory, "_stored", lambda uuid: SimpleNamespace(profile=nodes[uuid]))
+    directory._shown_in.update({uuid: {1: "mm"} for uuid in nodes})
+    directory._channels.update({uuid: ("digest", []) for uuid in nodes})
+    now = {"arm": {1: "mm"}, "finger": {1: "cm"}}
+    homes = set[Path]()
+    monkeypatch.setattr(
+        "teds_provision.ncap.nodes.directory.units_of_profile", lambda name, home: homes.add(home) or now[name]
+    )
+    before = directory.changes
+    assert directory.follow_profiles() == ["bb"]
+    assert (sorted(directory._channels), directory.changes) == (["aa", "cc"], before + 1)
+    assert directory.follow_profiles() == []
+    now["arm"] = {}
+    assert directory.follow_profiles() == ["aa", "cc"]
+    assert (directory._channels, directory.changes, homes) == ({}, before + 3, {station.home})
     station.close()
 
 
