@@ -67,7 +67,9 @@ def read_ca(path: Path, passphrase: str) -> bytes:
             f"Wrong passphrase for {path}.", hint="Try again. If it is right, the file is damaged."
         ) from None
     except Exception as error:  # for unsupported ciphers and curves the library raises many exception classes
-        raise VaultError(f"{path} contains an unsupported kind of key.") from error
+        raise VaultError(
+            f"{path} contains an unsupported kind of key.", hint="Give the file that trust ca export wrote."
+        ) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(key.curve, ec.SECP256R1):
         raise VaultError(f"{path} contains no P-256 key.", hint="Give the file that trust ca export wrote.")
     return key.private_numbers().private_value.to_bytes(32, "big")

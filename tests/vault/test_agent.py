@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ import pytest
 
 from teds_provision import files
 from teds_provision.cli.main import run as in_process
-from teds_provision.errors import WrongPassphraseError
+from teds_provision.errors import VaultError, WrongPassphraseError
 from teds_provision.vault import agent, selection
 from teds_provision.vault.base import Ask
 from teds_provision.vault.pkcs11 import Pkcs11Vault
@@ -290,6 +291,36 @@ def page_with(secret: bytes) -> agent.LockedPage:
     page.read(read)
     os.close(read)
     return page
+
+
+def test_a_page_takes_1024_octets_and_not_one_more() -> None:
+    assert bytes(page_with(b"x" * 1024).view()) == b"x" * 1024
+    with pytest.raises(ValueError, match="longer than any secret"):
+        page_with(b"x" * 1025)
+
+
+def test_what_cannot_be_kept_open_is_refused_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that would hold the secret has no home to stand in: it ends, and nothing is left of it."""
+    begun: list[subprocess.Popen[bytes]] = []
+    real = subprocess.Popen
+
+    def started(*words: Any, **how: Any) -> subprocess.Popen[bytes]:
+        begun.append(real(*words, **how))
+        return begun[0]
+
+    monkeypatch.setattr(agent.subprocess, "Popen", started)
+    with pytest.raises(VaultError) as refused:
+        agent.start(tmp_path / "nowhere", "file", b"secret", 60)
+    assert (
+        refused.value.message
+        == f"The vault cannot be kept open: agent.sock in {tmp_path / 'nowhere'} does not come up."
+    )
+    assert begun[0].returncode is not None, "it was waited for"
+    monkeypatch.delattr(socket, "SO_PEERCRED")
+    with pytest.raises(VaultError) as refused:
+        agent.start(tmp_path, "file", b"secret", 60)
+    assert refused.value.message == "unlock requires Linux: this system does not identify the peer of a socket."
+    assert len(begun) == 1
 
 
 @pytest.mark.parametrize(("question", "seconds"), [(agent.END, 60.0), (agent.SECRET, -1.0)], ids=["lock", "too late"])

@@ -8,10 +8,13 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
 from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import TedsProvisionError, VaultError, WrongPassphraseError
+from teds_provision.vault import ca_file
 from teds_provision.vault.ca_file import MAX_ROUNDS, ROUNDS, read_ca, write_ca
 from tests.pace import costs_at_most
 
@@ -66,6 +69,85 @@ def test_a_key_sealed_by_scrypt_is_refused_and_the_usual_openssl_ones_open(tmp_p
     )
     with pytest.raises(VaultError, match="encrypted in an unsupported way"):
         read_ca(tmp_path / "scrypt.pem", WORDS)
+
+
+PBES2, PBKDF2 = "06092a864886f70d01050d", "06092a864886f70d01050c"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "counted"),
+    [
+        ("30 0a 0402 abcd 0202 0800", True),  # a salt of two octets, 2,048 rounds
+        ("30 81 0a 0402 abcd 0202 0800", True),  # a length in the long form
+        ("30 82 000a 0402 abcd 0202 0800", True),
+        ("30 0a 0402 abcd 0208 0000000000989680", True),  # 10,000,000, the most
+        ("30 0a 0402 abcd 0208 0000000000989681", False),
+        ("30 0a 0402 abcd 0209 000000000000000800", False),  # a number of nine octets
+        ("30 0a 0402 abcd 0200", False),  # of none
+        ("31 0a 0402 abcd 0202 0800", False),  # no SEQUENCE
+        ("30 0a 0502 abcd 0202 0800", False),  # the salt is no OCTET STRING
+        ("30 0a 0480 abcd 0202 0800", False),  # its length is not one octet
+        ("30 0a 0402 abcd 0302 0800", False),  # the number is no INTEGER
+        ("30 0a 0402 abcd", False),  # cut off
+        ("30", False),
+        ("", False),
+    ],
+)
+def test_rounds_are_counted_before_a_passphrase_is_tried(tmp_path: Path, parameters: str, counted: bool) -> None:
+    """What is counted and not too much is tried, and is no key then; of anything else nothing is tried."""
+    path = tmp_path / "ca.pem"
+    path.write_text(pem_of(bytes.fromhex(f"{PBES2} {PBKDF2} {parameters}")))
+    with pytest.raises(VaultError) as refused:
+        read_ca(path, WORDS)
+    assert isinstance(refused.value, WrongPassphraseError) is counted
+    if not counted:
+        assert refused.value.message == f"{path} is encrypted in an unsupported way."
+        assert "PBES2 and PBKDF2 of at most 10,000,000 rounds" in refused.value.hint
+
+
+@pytest.mark.parametrize("missing", [PBES2, PBKDF2])
+def test_only_pbes2_with_pbkdf2_is_tried(tmp_path: Path, missing: str) -> None:
+    path = tmp_path / "ca.pem"
+    path.write_text(pem_of(bytes.fromhex(f"{PBES2} {PBKDF2} 300a0402abcd02020800".replace(missing, ""))))
+    with pytest.raises(VaultError, match="encrypted in an unsupported way"):
+        read_ca(path, WORDS)
+
+
+def test_what_is_no_base64_is_encrypted_in_no_way_that_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "ca.pem"
+    path.write_text("-----BEGIN ENCRYPTED PRIVATE KEY-----\nMIIBA\n-----END ENCRYPTED PRIVATE KEY-----\n")
+    with pytest.raises(VaultError, match="encrypted in an unsupported way"):
+        read_ca(path, WORDS)
+
+
+@pytest.mark.parametrize(
+    "key", [ec.generate_private_key(ec.SECP384R1()), ed25519.Ed25519PrivateKey.generate()], ids=["P-384", "Ed25519"]
+)
+def test_a_key_of_another_kind_is_no_ca_key(
+    tmp_path: Path, key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey
+) -> None:
+    path = tmp_path / "ca.pem"
+    sealed = BestAvailableEncryption(WORDS.encode())
+    path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, sealed))
+    with pytest.raises(VaultError) as refused:
+        read_ca(path, WORDS)
+    assert refused.value.message == f"{path} contains no P-256 key."
+    assert refused.value.hint == "Give the file that trust ca export wrote."
+
+
+@pytest.mark.parametrize("curve", ["06072a8648ce3d0201 06022a03", "06022a03"], ids=["curve", "algorithm"])
+def test_a_key_of_a_kind_that_no_one_knows_is_named_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: str
+) -> None:
+    path = tmp_path / "ca.pem"
+    monkeypatch.setattr(ca_file, "ROUNDS", 65_536)  # the number is no rule here, and costs
+    scalar = "0427 3025 020101 0420" + "07" * 32
+    own = bytes.fromhex(f"020100 30{len(bytes.fromhex(curve)):02x} {curve} {scalar}")
+    path.write_bytes(ca_file._encrypted_pem(bytes([0x30, len(own)]) + own, WORDS))
+    with pytest.raises(VaultError) as refused:
+        read_ca(path, WORDS)
+    assert refused.value.message == f"{path} contains an unsupported kind of key."
+    assert refused.value.hint == "Give the file that trust ca export wrote."
 
 
 @given(octets=st.binary(max_size=200))

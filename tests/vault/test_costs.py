@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
+from typing import NoReturn
 
-from teds_provision.vault.passphrase import Costs
+import pytest
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.kdf import argon2
+
+from teds_provision.errors import VaultError
+from teds_provision.vault.passphrase import Costs, SealingKey
 
 
 @pytest.mark.parametrize(
@@ -26,3 +31,27 @@ from teds_provision.vault.passphrase import Costs
 )
 def test_costs_are_tried_up_to_their_bounds(memory_kib: int, iterations: int, lanes: int, good: bool) -> None:
     assert Costs(memory_kib, iterations, lanes).bounded() is good
+
+
+@pytest.mark.parametrize(
+    ("failure", "message", "hint"),
+    [
+        (MemoryError(), "Not enough memory for Argon2id (64 KiB).", ""),
+        (
+            UnsupportedAlgorithm("argon2"),
+            "This Python's OpenSSL has no Argon2id.",
+            "Install the wheel of cryptography from PyPI.",
+        ),
+    ],
+    ids=["memory", "algorithm"],
+)
+def test_a_machine_that_cannot_run_argon2id_is_named_with_its_lack(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception, message: str, hint: str
+) -> None:
+    def fail(**_: object) -> NoReturn:
+        raise failure
+
+    monkeypatch.setattr(argon2, "Argon2id", fail)
+    with pytest.raises(VaultError) as refused:
+        SealingKey.derive("four random words here", costs=Costs(64, 1, 4))
+    assert (refused.value.message, refused.value.hint) == (message, hint)

@@ -253,6 +253,19 @@ def test_no_file_raises_anything_foreign(tmp_path_factory: pytest.TempPathFactor
         FileVault.open(home, STORE, Person())
 
 
+def test_a_file_of_more_than_64_kib_is_damage_and_read_no_further(tmp_path: Path, vault: FileVault) -> None:
+    """JSON may end in any number of blanks: only its size is wrong."""
+    path = tmp_path / "vault.json"
+    text = path.read_text()
+    path.write_text(text + " " * (64 * 1024 - len(text)))
+    assert FileVault.open(tmp_path, STORE, Person()).identity().point == vault.identity().point
+    path.write_text(text + " " * (64 * 1024 - len(text) + 1))
+    with pytest.raises(VaultError) as refused:
+        FileVault.open(tmp_path, STORE, Person())
+    assert refused.value.message == f"{path} is damaged or not a vault of this version."
+    assert refused.value.hint == "Restore a backup (teds-provision restore)."
+
+
 def test_a_deep_json_is_damage(tmp_path: Path) -> None:
     (tmp_path / "vault.json").write_text("[" * 60_000)
     with pytest.raises(VaultError):

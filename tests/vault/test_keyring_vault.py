@@ -16,6 +16,7 @@ from textwrap import dedent
 from typing import Any
 
 import pytest
+from keyring.errors import InitError, KeyringLocked, NoKeyringError
 
 from teds_provision.errors import KeyringUnavailableError, UsageError, VaultError
 from teds_provision.vault import keyring_vault, selection
@@ -227,6 +228,74 @@ def test_of_several_keyrings_the_one_with_the_entry_opens_and_else_the_first_tha
         on(*backends)
         with pytest.raises(VaultError, match=words):
             KeyringVault.open(STORE)
+
+
+SECRET_SERVICE = "keyring.backends.SecretService.Keyring"
+LIBSECRET, KWALLET = "keyring.backends.libsecret.Keyring", "keyring.backends.kwallet.DBusKeyring"
+
+
+@pytest.mark.parametrize(
+    ("platform", "desktop", "names"),
+    [
+        ("darwin", "KDE", ["keyring.backends.macOS.Keyring"]),
+        ("win32", "", ["keyring.backends.Windows.WinVaultKeyring"]),
+        ("linux", "", [SECRET_SERVICE, LIBSECRET, KWALLET]),
+        ("linux", "GNOME", [SECRET_SERVICE, LIBSECRET, KWALLET]),
+        ("linux", "KDE", [KWALLET, SECRET_SERVICE, LIBSECRET]),
+        ("linux", "X:KDE", [KWALLET, SECRET_SERVICE, LIBSECRET]),
+        ("linux", "KDE2", [SECRET_SERVICE, LIBSECRET, KWALLET]),
+    ],
+)
+def test_which_keyrings_are_tried_and_in_which_order(
+    monkeypatch: pytest.MonkeyPatch, platform: str, desktop: str, names: list[str]
+) -> None:
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setenv("XDG_CURRENT_DESKTOP", desktop)
+    assert keyring_vault._candidates() == names
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message", "hint"),
+    [
+        (
+            NoKeyringError(),
+            KeyringUnavailableError,
+            "This machine has no keyring that is suitable for",
+            "Start a Secret",
+        ),
+        (KeyringLocked(), VaultError, "The keyring is locked and was not unlocked (a keyring in memory).", "Unlock it"),
+        (InitError(), VaultError, "The keyring is locked and was not unlocked (a keyring in memory).", "Unlock it"),
+        (OSError(), VaultError, "The keyring failed (a keyring in memory: OSError).", "Check that its service runs."),
+    ],
+    ids=lambda part: type(part).__name__ if isinstance(part, Exception) else None,
+)
+def test_a_keyring_that_fails_says_how_and_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[VaultError], message: str, hint: str
+) -> None:
+    name = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}"
+    monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
+    monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, BrokenKeyring(error))]))
+    for attempt in (lambda: KeyringVault.open(STORE), keyring_vault.inspect):
+        with pytest.raises(VaultError) as failed:
+            attempt()
+        assert type(failed.value) is kind
+        assert failed.value.message.startswith(message)
+        assert failed.value.hint.startswith(hint)
+
+
+def test_a_keyring_that_answers_is_named_and_has_no_passphrase_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}"
+    backend = MemoryKeyring()
+    monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
+    monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, backend)]))
+    assert keyring_vault.inspect() == "a keyring in memory"
+    assert backend.entries == {}, "to look changes nothing"
+    vault = KeyringVault.create(STORE)
+    assert vault.opener() == b""
+    with pytest.raises(VaultError) as refused:
+        vault.new_passphrase(never)
+    assert refused.value.message == "The keyring has its own passphrase (a keyring in memory)."
+    assert refused.value.hint.startswith("Change it with the keyring's own program")
 
 
 # From here on a real Secret Service.

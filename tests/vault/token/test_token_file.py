@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import stat
 
 import pytest
@@ -201,3 +202,58 @@ def test_a_backup_joins_what_another_process_has_added_by_then(vault, home, stor
     other._join(backup)
     assert Pkcs11Vault.open(home, store_id, uri, Person()).unwrap(wrapped, context=CONTEXT) == b"k" * 16
     assert other.masters() == (1, 2, 3)
+
+
+def signed_again(vault, home, **changes):
+    """Write the file with other members, signed by the station key in the token."""
+    members = {name: value for name, value in json.loads((home / FILE_NAME).read_text()).items() if name != "signature"}
+    members |= changes
+    members["signature"] = vault.identity().sign(pkcs11._signed(members)).hex()
+    (home / FILE_NAME).write_text(json.dumps(members))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pins": "1"}, "vault-pkcs11.json is damaged (pins)."),
+        ({"nonce": "0g"}, "vault-pkcs11.json is damaged (nonce)."),
+        ({"sealed": 5}, "vault-pkcs11.json is damaged (sealed)."),
+        ({"sealed": "00" * 48}, "The token does not open what was sealed to its key."),
+        ({"nonce": ""}, "The token does not open what was sealed to its key."),
+        ({"station": 1}, "vault-pkcs11.json does not say which key is the station key."),
+        ({"station": {"label": "x", "id": "01"}}, "vault-pkcs11.json does not say which key is the station key."),
+        ({"ca": {"label": "x", "id": "0g", "point": ""}}, "vault-pkcs11.json does not say which key is the CA key."),
+    ],
+)
+def test_a_member_that_is_something_else_is_named(vault, home, store_id, uri, changes, message):
+    """Even under a good signature: only the station itself could have written it, by a defect."""
+    signed_again(vault, home, **changes)
+    with pytest.raises(VaultError) as refused:
+        Pkcs11Vault.open(home, store_id, uri, Person())
+    assert refused.value.message == message
+    cure = (
+        "Check the token's driver." if "does not open" in message else "Restore this file from a backup of this station"
+    )
+    assert refused.value.hint.startswith(cure)
+
+
+def test_a_key_in_the_token_that_is_not_the_one_from_init_is_refused(vault, home, store_id, uri):
+    own = json.loads((home / FILE_NAME).read_text())["station"]
+    signed_again(vault, home, station={**own, "point": SoftwareKey(5).point.hex()})
+    with pytest.raises(VaultError) as refused:
+        Pkcs11Vault.open(home, store_id, uri, Person())
+    assert refused.value.message == f"The station key {own['label']!r} in the token 'bench' is not the one from init."
+    assert refused.value.hint == "Plug in the token that was used at init."
+
+
+def test_no_ca_key_comes_from_a_file_and_master_keys_of_another_process_are_taken_as_they_are(vault, tmp_path):
+    with pytest.raises(VaultError) as refused:
+        vault.import_ca(tmp_path / "ca.pem", "a passphrase for the safe")
+    assert refused.value.message == "A CA key from a file cannot be imported into a token."
+    assert refused.value.hint == "Use --keystore file in another home."
+    before, other = vault.master_keys(), MasterKeys({7: bytes(range(32))})
+    wrapped = other.wrap(bytes(16), context=b"x")
+    vault.accept(other)
+    assert (vault.masters(), vault.unwrap(wrapped, context=b"x")) == ((7,), bytes(16))
+    vault.reread()
+    assert vault.master_keys().keys == before.keys, "the file says otherwise"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from teds_provision.errors import UsageError, VaultError, WrongPassphraseError
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.vault.pkcs11 import Pkcs11Vault
-from teds_provision.vault.pkcs11_token import _tries, ask_pin
+from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, _tries, ask_pin, find_token, log_in
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 from tests.vault.softhsm import MODULE, PIN, unload
 from tests.vault.token.person import Person, in_new_process
@@ -135,3 +138,209 @@ def test_a_general_error_of_the_module_gets_one_more_try_and_no_second():
         guarded(lambda: fail(DeviceRemoved()))
     assert len(calls) == 1
     assert "Plug it in" in refused.value.hint
+
+
+class Refusing:
+    """A token that refuses every session, as SoftHSM never does."""
+
+    label = "t"
+
+    def __init__(self, error, flags=0):
+        self.error, self.flags = error, flags
+        self.slot = SimpleNamespace(get_token=lambda: self)
+        self.tries = []
+
+    def open(self, *, rw, user_pin=None):
+        self.tries.append((rw, user_pin))
+        raise self.error
+
+
+WRONG = "The PIN of the token 't' is wrong. The token does not say how many attempts are left."
+LOCKED = "The PIN of the token 't' is locked after too many wrong attempts."
+
+
+@pytest.mark.parametrize(
+    ("error", "flags", "kind", "message", "hint"),
+    [
+        ("PinIncorrect", 0, WrongPassphraseError, WRONG, "Run it again with the right PIN; it is not retried"),
+        ("PinInvalid", 0, WrongPassphraseError, WRONG, "Run it again with the right PIN"),
+        ("PinLenRange", 0, WrongPassphraseError, WRONG, "Run it again with the right PIN"),
+        ("ArgumentsBad", 0, WrongPassphraseError, WRONG, "Run it again with the right PIN"),
+        ("PinIncorrect", "USER_PIN_LOCKED", VaultError, LOCKED, "Set a new PIN with the security officer's PIN"),
+        ("PinLocked", 0, VaultError, LOCKED, "Set a new PIN with the security officer's PIN"),
+        ("PinExpired", 0, VaultError, "The token 't' has no valid user PIN.", "Set one with the token's own tool."),
+        ("UserPinNotInitialized", 0, VaultError, "The token 't' has no valid user PIN.", "Set one with the token's"),
+        ("DeviceRemoved", 0, VaultError, "The token failed (DeviceRemoved).", "Plug it in and run this again."),
+        ("TokenNotPresent", 0, VaultError, "The token failed (TokenNotPresent).", "Plug it in and run this again."),
+        ("HostMemory", 0, VaultError, "The token failed (HostMemory).", "Check it with its own tool."),
+    ],
+)
+@pytest.mark.parametrize("write", [False, True])
+def test_a_login_that_a_token_refuses_is_tried_once_and_named(error, flags, kind, message, hint, write):
+    from pkcs11 import TokenFlag, exceptions
+
+    token = Refusing(getattr(exceptions, error)(), TokenFlag[flags] if flags else 0)
+    with pytest.raises(VaultError) as refused:
+        log_in(token, Pkcs11Uri("/m.so", token="t"), "1234", write=write)
+    assert type(refused.value) is kind
+    assert refused.value.message == message
+    assert refused.value.hint.startswith(hint)
+    assert token.tries == [(write, "1234")], "a token locks after some tries"
+
+
+def test_a_token_with_a_pin_pad_is_told_to_ask_itself():
+    from pkcs11 import PROTECTED_AUTH, exceptions
+
+    token = Refusing(exceptions.PinIncorrect())
+    with pytest.raises(WrongPassphraseError):
+        log_in(token, Pkcs11Uri("/m.so", token="t"), None, write=False)
+    assert token.tries == [(False, PROTECTED_AUTH)]
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message", "hint"),
+    [
+        (
+            "PinIncorrect",
+            WrongPassphraseError,
+            "The PIN of the token 't' is wrong.",
+            "Run it again with the right PIN.",
+        ),
+        (
+            "ArgumentsBad",
+            WrongPassphraseError,
+            "The PIN of the token 't' is wrong.",
+            "Run it again with the right PIN.",
+        ),
+        (
+            "PinInvalid",
+            VaultError,
+            "The token 't' does not accept this as a new PIN.",
+            "Check its length and characters.",
+        ),
+        ("PinLenRange", VaultError, "The token 't' does not accept this as a new PIN.", "Check its length and"),
+        ("DeviceError", VaultError, "The token failed (DeviceError).", "Plug it in and run this again."),
+        ("GeneralError", VaultError, "The token failed (GeneralError).", "Check it with its own tool."),
+    ],
+)
+def test_a_new_pin_that_a_token_refuses_is_tried_once_and_named(error, kind, message, hint):
+    from pkcs11 import exceptions
+
+    token = Refusing(getattr(exceptions, error)())
+    with pytest.raises(VaultError) as refused:
+        TokenSession(None, token).set_pin("1234", "5678")
+    assert type(refused.value) is kind
+    assert refused.value.message == message
+    assert refused.value.hint.startswith(hint)
+    assert token.tries == [(True, None)]
+
+
+def test_a_token_whose_pin_is_locked_is_named_before_anyone_is_asked(monkeypatch):
+    import pkcs11
+
+    token = SimpleNamespace(
+        label="t", flags=pkcs11.TokenFlag.USER_PIN_LOCKED, serial=b"1", manufacturer_id="m", model="x"
+    )
+    token.slot = SimpleNamespace(slot_id=0)
+    monkeypatch.setattr(pkcs11, "lib", lambda _path: SimpleNamespace(get_tokens=lambda: [token]))
+    with pytest.raises(VaultError) as refused:
+        find_token(Pkcs11Uri("/m.so", token="t"))
+    assert refused.value.message == LOCKED
+    token.flags = 0
+    assert find_token(Pkcs11Uri("/m.so", token="t")) is token
+
+
+POINT = SoftwareKey(7).point
+
+
+class Objects:
+    """A session on a token that holds what a test says."""
+
+    def __init__(self, private, public=()):
+        self.private, self.public = private, public
+
+    def get_objects(self, wanted):
+        from pkcs11 import Attribute, ObjectClass
+
+        return iter(self.private if wanted[Attribute.CLASS] == ObjectClass.PRIVATE_KEY else self.public)
+
+
+class Held(dict):
+    """An object of a token; an attribute that it lacks is an error of the module."""
+
+    label, id = "station", b"\1"
+
+    def __missing__(self, _attribute):
+        from pkcs11.exceptions import AttributeTypeInvalid
+
+        raise AttributeTypeInvalid
+
+
+def test_the_public_point_is_read_wherever_a_token_shows_it(monkeypatch):
+    import pkcs11
+    from pkcs11 import Attribute
+
+    monkeypatch.setattr(pkcs11, "PrivateKey", Held)
+    safe = {Attribute.SENSITIVE: True, Attribute.EXTRACTABLE: False}
+    der = b"\x04\x41" + POINT
+
+    def found(private, *public):
+        return TokenSession(Objects([private], public), SimpleNamespace(label="t")).find(label=None, identifier=None)
+
+    for private, public in (
+        (Held(safe), (Held({Attribute.EC_POINT: der}),)),
+        (Held(safe), (Held({Attribute.EC_POINT: POINT}),)),  # some modules leave the OCTET STRING out
+        (Held(safe), (Held(), Held({Attribute.EC_POINT: der}))),
+        (Held({**safe, Attribute.EC_POINT: der}), ()),  # and some show it at the private key alone
+        (Held({**safe, Attribute.EC_POINT: der}), (Held(),)),
+    ):
+        assert found(private, *public).point == POINT
+    with pytest.raises(VaultError) as refused:
+        found(Held(safe), Held())
+    assert refused.value.message == "The token 't' shows no public key beside 'station'."
+    assert refused.value.hint.startswith("Load the public key with the same label and id")
+    with pytest.raises(VaultError, match=r"^The key 'station' of the token is not a P-256 key\.$"):
+        found(Held(safe), Held({Attribute.EC_POINT: der[:-1]}))
+    for unsafe in ({**safe, Attribute.SENSITIVE: False}, {**safe, Attribute.EXTRACTABLE: True}):
+        with pytest.raises(VaultError) as refused:
+            found(Held(unsafe), Held({Attribute.EC_POINT: der}))
+        assert refused.value.message == "The key 'station' can leave the token 't', so it is not used."
+        assert refused.value.hint.startswith("Let teds-provision create one")
+    two = TokenSession(Objects([Held(safe)] * 2), SimpleNamespace(label="t"))
+    with pytest.raises(VaultError) as refused:
+        two.find(label=None, identifier=None)
+    assert refused.value.message == "2 keys of the token 't' match."
+    assert refused.value.hint == "Select one by object= and id= in the URI."
+
+
+def test_a_key_that_a_token_made_and_does_not_show_is_named(monkeypatch):
+    session = TokenSession(Objects([]), SimpleNamespace(label="t"))
+    monkeypatch.setattr(session, "_generate", lambda _label, _identifier: None)
+    with pytest.raises(VaultError) as refused:
+        session.generate(label="station", identifier=b"\1")
+    assert refused.value.message == "The token created a key but does not show it."
+    assert refused.value.hint == "Inspect it with pkcs11-tool -O."
+
+
+@pytest.mark.parametrize("error", ["MechanismParamInvalid", "DomainParamsInvalid"])
+@pytest.mark.parametrize("secret", [bytes(range(32)), bytes(range(1, 31))], ids=["32 octets", "30 octets"])
+def test_a_point_is_given_in_der_to_a_module_that_asks_for_it(error, secret):
+    """The secret is x in 32 octets, whatever a module leaves out in front; its object is destroyed."""
+    from pkcs11 import Attribute, exceptions
+
+    given, destroyed = [], []
+
+    class Secret(dict):
+        def destroy(self):
+            destroyed.append(1)
+
+    class Key:
+        def derive_key(self, _kind, bits, *, mechanism, mechanism_param, template):
+            given.append((bits, mechanism_param[2]))
+            if mechanism_param[2] == POINT:
+                raise getattr(exceptions, error)
+            return Secret({Attribute.VALUE: secret})
+
+    assert TokenKey(Key(), POINT, "station", b"\1").ecdh(POINT) == secret.rjust(32, b"\0")
+    assert given == [(256, POINT), (256, b"\x04\x41" + POINT)]
+    assert destroyed == [1]
