@@ -139,6 +139,39 @@ def test_a_time_of_today_has_no_date_and_what_is_no_time_stays(stage: Stage) -> 
     )
 
 
+def test_ages_rates_ranges_and_numbers_of_things_are_short_words(stage: Stage) -> None:
+    stage.table(
+        "format.age(one)",
+        [
+            (NONE, "never"), (0, "now"), (1.4, "now"), (1.5, "2 s ago"), (89.4, "89 s ago"), (90, "2 min ago"),
+            (5399, "90 min ago"), (5400, "2 h ago"), (129_599, "36 h ago"), (129_600, "2 days ago"),
+            (864_000, "10 days ago"), (-5, "now"),
+        ],
+    )  # fmt: skip
+    stage.table(
+        "format.hertz(one)",
+        [(NONE, "not stated"), (0, "not stated"), (-1, "not stated"), (0.5, "0.5 Hz"), (999.94, "999.9 Hz"),
+         (1000, "1 kHz"), (2500, "2.5 kHz")],
+    )  # fmt: skip
+    stage.table(
+        "format.range(one)",
+        [
+            ({"low": 0, "high": 110, "unit": "mm"}, "0 to 110 mm"), ({"low": 0, "high": 0, "unit": ""}, "0 to 0"),
+            ({"low": -5, "high": NONE, "unit": "V"}, "from \u22125 V"), ({"high": 5, "unit": "V"}, "up to 5 V"),
+            ({"unit": "V"}, "not stated"),
+        ],
+    )  # fmt: skip
+    stage.table(
+        "format.count(...one)",
+        [([0, "node"], "0 nodes"), ([1, "node"], "1 node"), ([2, "node"], "2 nodes"),
+         ([1, "entry", "entries"], "1 entry"), ([2, "entry", "entries"], "2 entries")],
+    )  # fmt: skip
+    stage.table(
+        "format.nameOf(one)",
+        [({"name": "x", "uuid": ARM}, "x"), ({"name": "", "uuid": ARM}, "node a1a1a1a1"), (NONE, "unknown node")],
+    )
+
+
 def test_names_and_keys_are_written_as_people_compare_them(stage: Stage) -> None:
     stage.table("format.grouped(one)", [("abcdef01", "abcd ef01"), ("abcde", "abcd e"), (NONE, "")])
     stage.table(

@@ -93,6 +93,52 @@ def test_a_card_has_three_values_and_a_tapped_one_is_marked_for_eight_seconds(st
     assert texts(stage, ".detail .empty .lead") == ["Node not found."]
 
 
+def test_what_is_open_beside_the_list_gives_way_to_what_is_chosen(stage: Stage) -> None:
+    nodes(stage, gripper(), {"uuid": HAND, "name": "slew"})
+    listing(stage)
+    heads = ".detail h2"
+    look = """
+      const main = document.getElementById("main");
+      return [main.classList.contains("one-open"), main.querySelectorAll(".tabs").length];
+    """
+    assert (texts(stage, heads), stage.run(look)) == (["hand"], [False, 1]), "the first one, if none is chosen"
+    for rest, head, tabs in (
+        (["next", "provision"], "Provision the next tapped node", 0), (["update"], "Firmware update", 0),
+        ([HAND, "history"], "slew", 1), (["update"], "Firmware update", 0),
+        (["next", "provision"], "Provision the next tapped node", 0), ([ARM], "hand", 1), ([HAND], "slew", 1),
+    ):  # fmt: skip
+        stage.run("window.view.go(words)", *rest)
+        stage.pass_time(20)
+        assert (texts(stage, heads), stage.run(look)) == ([head], [True, tabs]), rest
+    stage.run("window.view.go(['unheard of'])")
+    assert (texts(stage, heads), texts(stage, ".detail .empty .lead")) == ([], ["Node not found."])
+    change(stage, loaded=False)
+    assert texts(stage, ".detail *") == [], "it may still come"
+    stage.run("window.view.go([])")
+    assert texts(stage, heads) == ["hand"]
+
+
+def test_boards_of_an_update_are_those_selected_in_the_list(stage: Stage) -> None:
+    nodes(stage, gripper(), {"uuid": HAND, "name": "slew"})
+    listing(stage, "update")
+    selected = ".detail .stack > p"
+    assert text(stage, selected) == "No boards are selected."
+    press(stage, "Select boards")
+    assert stage.run("return [location.hash, document.activeElement.innerText]") == ["#/nodes", "All listed"]
+    assert stage.page.get_by_role("button", name="Select", pressed=True, exact=True).count() == 1
+    stage.page.get_by_label("Select slew").check()
+    stage.pass_time(20)
+    assert text(stage, selected) == "1 board selected: slew"
+    stage.page.get_by_label("Select slew").uncheck()
+    stage.page.get_by_label("Select hand").check()
+    stage.pass_time(20)
+    assert text(stage, selected) == "1 board selected: hand"
+    press(stage, "Select")
+    stage.pass_time(20)
+    assert text(stage, selected) == "No boards are selected."
+    assert stage.page.get_by_label("Select slew").is_hidden()
+
+
 def test_without_a_node_it_says_what_to_do_and_who_was_not_opened(stage: Stage) -> None:
     stage.run("state.loaded = false")
     listing(stage)
@@ -288,6 +334,81 @@ def test_a_job_is_open_until_its_last_day(stage: Stage) -> None:
     ]  # fmt: skip
 
 
+def test_a_station_of_the_plant_is_good_while_it_is_heard_and_plain_when_it_is_gone(stage: Stage) -> None:
+    words = ["here", "heard", "retired", "lost", "stolen", "silent"]
+    stations = [{"fingerprint": word, "name": word, "state": word, "roles": ["base"], "page": 1, "age": age}
+                for word, age in zip(words, (NONE, 119, 120, 7199, 7200, 172_800), strict=True)]  # fmt: skip
+    plant: dict[str, Any] = {"name": "p", "roster": 1, "expires": NOW, "age": 0, "why": "", "unsent": 0, "to_rotate": 0,
+                             "alarms": [], "stations": stations, "conflicts": []}  # fmt: skip
+    stage.answers(**{"GET plant": plant, "GET status": {"plant": True}, "GET jobs": {"jobs": []}})
+    stage.run("state.status = { plant: true, links: [] }; show(station.stationView(document.getElementById('main')))")
+    stage.pass_time(20)
+    tones = "return [...document.querySelectorAll('[aria-label=Plant] .chip')].map((one) => one.classList[1])"
+    assert stage.run(tones) == ["good", "good", "plain", "plain", "plain", "warn"]
+    assert [line.partition("page 1")[2] for line in texts(stage, "[aria-label=Plant] > ul:first-of-type li")] == [
+        " here", ", 119 s ago heard", ", 2 min ago retired", ", 119 min ago lost", ", 2 h ago stolen",
+        ", 2 days ago silent",
+    ]  # fmt: skip
+    assert texts(stage, "[aria-label=Plant] > dl dd")[1:] == ["0 s ago", "0 events"]
+
+
+def test_an_open_job_is_asked_again_and_its_bars_are_as_long_as_its_numbers(stage: Stage) -> None:
+    part = {"name": "north", "allotment": 4, "units": 5, "passed": 4, "first_pass": 0.6, "over": True, "attempts": 7,
+            "steps": {"agree": {"median": 1, "worst": 2.5}, "write": {"median": 0.5, "worst": 0.5}},
+            "failures": {"node-silent": 1, "no-key": 2}}  # fmt: skip
+    none = {"name": "south", "allotment": 10, "units": 0, "passed": 0, "first_pass": NONE, "over": False,
+            "attempts": 0, "steps": {}, "failures": {}}  # fmt: skip
+    now = stage.run("return hub.now()")
+    job = {
+        "id": "j",
+        "title": "fingers",
+        "passed": 3,
+        "total": 5,
+        "profile": "gripper",
+        "state": "open",
+        "ends": now + 9,
+    }
+    stage.answers(**{"GET jobs/j": job | {"stations": [part, none]}})
+    stage.run("state.status = { links: [] }; window.panel = show(line.linePanel())")
+    stage.run("document.getElementById('main').append(window.panel.panel)")
+    stage.pass_time(20)
+    panel = stage.page.get_by_role("region", name="Line")
+    assert (stage.sent, panel.is_hidden()) == ([], True), "without a plant there is no line"
+    stage.answers(**{"GET jobs": {"jobs": [job]}})
+    change(stage, status={"plant": True, "links": []})
+    assert ([entry["path"] for entry in stage.sent], panel.is_visible()) == (["jobs"], True)
+    change(stage)
+    assert stage.sent == [], "it is shown now, and asked again later"
+    stage.page.get_by_text("fingers").click()
+    stage.page.get_by_text("first pass").first.wait_for()
+    assert [entry["path"] for entry in stage.sent] == ["jobs/j"]
+    bars = """
+      const bars = [...document.querySelectorAll(".bars .share")];
+      return bars.map((bar) => [...bar.children].map((one) => [one.className, Number.parseFloat(one.style.width)]));
+    """
+    assert stage.run(bars) == [
+        [["good", 60]], [["good", 80]], [["", 100]],  # of the boards that have begun, more than were allotted
+        [["farther", 100], ["", 40]], [["farther", 20], ["", 20]],  # of the slowest step
+        [["bad", 50]], [["bad", 100]],
+        [["good", 0]], [["good", 0]], [["", 0]],
+    ]  # fmt: skip
+    stage.answers(**{"GET jobs/j": job | {"stations": [part | {"allotment": 10, "over": False}]}})
+    stage.pass_time(10_000)
+    assert [entry["path"] for entry in stage.sent] == ["jobs", "jobs/j"]
+    assert stage.run(bars)[:3] == [[["good", 30]], [["good", 40]], [["", 50]]]
+    assert texts(stage, ".station-part h4") == ["north"]
+    stage.page.get_by_text("fingers").click()
+    stage.page.get_by_text("first pass").first.wait_for(state="hidden")
+    stage.pass_time(10_000)
+    assert [entry["path"] for entry in stage.sent] == ["jobs"], "a closed one is not asked"
+    stage.answers(**{"GET jobs": {"refused": 503}})
+    stage.pass_time(10_000)
+    assert panel.is_visible(), "what was known stays"
+    stage.answers(**{"GET jobs": {"jobs": []}})
+    stage.pass_time(10_000)
+    assert panel.is_hidden()
+
+
 CHANNELS = [
     {"uuid": ARM, "number": 1, "label": "opening", "unit": "mm"},
     {"uuid": ARM, "number": 2, "label": "force", "unit": "N"},
@@ -419,13 +540,15 @@ GO = """
 
 
 def tap(stage: Stage, uuid: str) -> Any:
+    stage.run("window.sockets.at(-1).tell({ type: 'beat' })")
     stage.run("hub.take({ type: 'event', event: 'node', uuid: words[0], state: 'tapped' })", uuid)
     stage.pass_time(100)
     return stage.run("return location.hash")
 
 
 def test_the_page_as_a_whole(whole: Stage) -> None:
-    """Three in one, as each would start the page again."""
+    """All in one, as each would start the page again."""
+    begin_with_the_nodes(whole)
     open_what_is_tapped(whole)
     whole.run("document.getElementById('toasts').replaceChildren()")
     show_the_view_of_an_address(whole)
@@ -434,6 +557,40 @@ def test_the_page_as_a_whole(whole: Stage) -> None:
     whole.run("window.sockets.at(-1).tell({ type: 'beat' })")  # it was silent meanwhile
     whole.pass_time(20)
     show_the_connection(whole)
+
+
+def begin_with_the_nodes(whole: Stage) -> None:
+    """Without an address the list is open, and the header is read aloud from left to right."""
+    assert whole.run("return [document.title, document.getElementById('main').className]") == [
+        "Nodes \u2013 base station", "view-nodes",
+    ]  # fmt: skip
+    assert len(texts(whole, ".card")) == 2
+    assert whole.page.locator("#bar").aria_snapshot() == HEADER
+    assert whole.run("return document.getElementById('connection').className") == "pill good"
+    assert whole.run("return document.body.classList.contains('lost')") is False
+
+
+HEADER = """\
+- banner:
+  - heading "Base station bench" [level=1]
+  - text: Live
+  - navigation "Views":
+    - link "Nodes":
+      - /url: "#/nodes"
+    - link "Measure":
+      - /url: "#/measure"
+    - link "Virtual":
+      - /url: "#/virtual"
+    - link "Log":
+      - /url: "#/log"
+    - link "Station":
+      - /url: "#/station"
+  - text: Detection
+  - group "Detection":
+    - button "Whitelist" [pressed]
+    - button "Transparent"
+  - button "Discover"\
+"""
 
 
 def open_what_is_tapped(whole: Stage) -> None:
@@ -459,6 +616,24 @@ def open_what_is_tapped(whole: Stage) -> None:
     assert texts(whole, ".toast")[-1].endswith(
         "Not opened because you are holding an actuator. It is marked under Nodes."
     )
+    whole.run("delete document.querySelector('main').firstChild.dataset.held")
+    whole.run("document.activeElement.value = document.activeElement.defaultValue; document.activeElement.focus()")
+    run = "state.runs.set(words[0], { state: 'done', steps: [], heard: performance.now() - words[1] })"
+    for at, ago, opened in (
+        ("#/nodes/next/provision", 2900, f"#/nodes/{HAND}/provision"), ("#/nodes", 3100, f"#/nodes/{HAND}"),
+        ("#/nodes/", 9999, f"#/nodes/{HAND}"), (f"#/nodes/{HAND}/history", 9999, f"#/nodes/{HAND}/history"),
+        (f"#/nodes/{HAND}/history", 100, f"#/nodes/{HAND}/provision"), (f"#/nodes/{ARM}", 100, f"#/nodes/{ARM}"),
+    ):  # fmt: skip
+        whole.run(GO if whole.run("return location.hash") != at else "", at)
+        whole.run("document.getElementById('toasts').replaceChildren()")
+        whole.run(run, HAND, ago)
+        assert tap(whole, HAND) == opened, (at, ago)
+        assert texts(whole, ".toast") == (["Tapped: slew. Open it"] if at.endswith(ARM) else []), at
+    assert whole.page.get_by_role("link", name="Open it").get_attribute("href") == f"#/nodes/{HAND}"
+    whole.run("state.runs.clear()")
+    whole.answers(**{f"GET nodes/{THIRD}": {"refused": 404}})
+    tap(whole, THIRD)
+    assert whole.said == "Tapped: node c3c3c3c3."
 
 
 def show_the_connection(whole: Stage) -> None:
@@ -474,7 +649,12 @@ def show_the_connection(whole: Stage) -> None:
     whole.answers(**{"PUT detection": {"refused": 409, "message": "Not now.", "hint": "Later."}})
     press(whole, "Transparent")
     assert whole.sent[0] == {"method": "PUT", "path": "detection", "body": {"mode": "transparent"}}
-    assert texts(whole, ".toast") == ["Not now. Later."]
+    assert texts(whole, ".toast.bad") == ["Not now. Later."]
+    whole.answers(**{"PUT detection": {}})
+    press(whole, "Transparent")
+    whole.pass_time(20)
+    assert [entry["path"] for entry in whole.sent] == ["detection", "status", "nodes"]
+    assert whole.said == "Detection: transparent. Read and show every node found."
     for answer, words in (
         ({"nodes": [1, 2]}, "2 nodes answered."),
         ({"nodes": []}, "No node answered. Is it powered and on the bus?"
@@ -485,6 +665,24 @@ def show_the_connection(whole: Stage) -> None:
         press(whole, "Discover")
         whole.pass_time(20)
         assert texts(whole, ".toast")[-1] == words
+        assert (
+            whole.page.locator(".toast").last.get_attribute("class")
+            == f"toast {'bad' if 'refused' in answer else 'good'}"
+        )
+    assert whole.said == "Looking for nodes on every link."
+    asked = [entry["path"] for entry in whole.sent]
+    assert [path for path in asked if path != "status"] == ["discover", "nodes"] * 2 + ["discover"]
+    assert asked[:3] == ["discover", "nodes", "status"]
+    whole.answers(**{"POST discover": HELD})
+    press(whole, "Discover")
+    change(whole, total=2)
+    assert whole.page.get_by_role("button", name="Discover").is_disabled()
+    whole.run("window.held.shift()({ nodes: [] })")
+    whole.answers(**{"GET status": {"links": [{"virtual": True}]}, "POST discover": {"nodes": []}})
+    whole.run("await hub.refresh('status')")
+    press(whole, "Discover")
+    whole.pass_time(20)
+    assert texts(whole, ".toast")[-1].startswith("No node answered. No link is configured, so no board is found.")
     problem = {"message": "No passphrase.", "hint": "Unlock it."}
     whole.answers(**{"GET status": {"links": [], "vault": {"problem": problem}, "write": False}})
     whole.run("await hub.refresh('status')")
@@ -496,16 +694,20 @@ def show_the_connection(whole: Stage) -> None:
     whole.run("window.sockets.at(-1).end(1006)")
     whole.pass_time(20)
     assert (text(whole, "#connection"), whole.said) == ("Connection lost", "Connection lost.")
+    look = "return [document.getElementById('connection').className, document.body.classList.contains('lost')]"
+    assert whole.run(look) == ["pill bad", True]
     assert text(whole, "#banner").startswith("Connection to the base station lost. These values are out of date.")
     whole.pass_time(320)
     whole.run("window.sockets.at(-1).tell({ type: 'beat' })")
     whole.pass_time(20)
     assert (text(whole, "#connection"), whole.said) == ("Live", "Connected.")
+    assert whole.run(look) == ["pill good", False]
     whole.run("window.sockets.at(-1).end(1008)")
     whole.pass_time(20)
     assert (text(whole, "#connection"), whole.page.locator("#banner code").inner_text()) == (
         "Signed out", "teds-provision ncap open",
     )  # fmt: skip
+    assert whole.run(look) == ["pill bad", True]
     whole.sent  # noqa: B018
     whole.pass_time(4100)
     assert whole.sent == [], "it asks no more"

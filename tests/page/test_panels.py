@@ -393,3 +393,132 @@ def test_each_channel_has_its_value_its_age_and_its_facts(stage: Stage) -> None:
         stage.pass_time(20)
         assert texts(stage, figures)[0] == words
         assert stage.run(meters)[0][0] == (70 if "70" in words else 0)
+
+
+LISTS = {"measurements": {"measurements": []}, "groups": {"groups": [PAIR]}, "nodes": {"nodes": [gripper(), ANGLE]}}
+
+
+@pytest.mark.parametrize(
+    ("act", "running", "lists"),
+    [
+        ("Start pair", [], ["groups", "measurements", "nodes"]),
+        ("Stop pair", [RUNNING], ["groups", "measurements", "nodes"]),
+        ("Save members", [], ["groups", "measurements", "nodes"]),
+        ("Delete group", [], ["groups", "measurements", "nodes"]),
+        ("Measure all trusted nodes", [], ["measurements", "nodes"]),
+        ("Stop", [{"id": "x", "state": "running", "uuids": [ARM], "nodes": []}], ["measurements", "nodes"]),
+        ("Create group", [], ["groups", "nodes"]),
+    ],
+)
+def test_what_an_act_changes_is_fetched_anew_and_a_button_waits_for_it(
+    measuring: Stage, act: str, running: list[dict[str, Any]], lists: list[str]
+) -> None:
+    measuring.answers(**{f"GET {name}": answer for name, answer in LISTS.items()})
+    measured(measuring, *running)
+    measuring.run("document.querySelectorAll('details').forEach((one) => (one.open = true))")
+    measuring.page.get_by_label("Name", exact=True).fill("new")
+    measuring.run("document.querySelectorAll('.new input[type=checkbox]').forEach((one) => (one.checked = true))")
+    paths = {"POST groups", "POST measurements", "PUT groups/pair", "DELETE groups/pair",
+             "DELETE measurements/x", "DELETE measurements/m 1"}  # fmt: skip
+    measuring.answers(**dict.fromkeys(paths, "held"))
+    measuring.sent  # noqa: B018
+    press(measuring, act)
+    assert len(sent(measuring)) == 1
+    waits = """
+      const named = (one) => (one.getAttribute("aria-label") ?? one.textContent).trim() === words[0];
+      const button = [...document.querySelectorAll("button")].find(named);
+      return [button.disabled, button.getAttribute("aria-busy")];
+    """
+    change(measuring, total=3)
+    if act not in ("Delete group", "Save members"):  # who could press these again would ask for the same
+        assert measuring.run(waits, act) == [True, "true"]
+    measuring.run("window.held.splice(0).forEach((go) => go({}))")
+    measuring.pass_time(20)
+    assert sorted(entry["path"] for entry in measuring.sent) == lists
+    assert measuring.run(waits, act)[1] is NONE
+    if act == "Create group":
+        assert measuring.run("return [document.querySelector('.new').open, document.querySelector('.new input').value]"
+                             ) == [False, ""]  # fmt: skip
+
+
+def test_a_refused_act_says_why_beside_it(stage: Stage) -> None:
+    no = {"refused": 409, "message": "Not now.", "hint": "Later."}
+    mode(stage)
+    own = {"id": "m", "state": "running", "uuids": [ARM], "owner": "page", "sinks": [], "nodes": [], "lower_rate": 10}
+    stage.answers(**{"POST measurements": no, "DELETE measurements/m": no})
+    press(stage, "Measure")
+    assert texts(stage, ".mode .trouble") == ["Not now. Later."]
+    stage.answers(**{"POST measurements": {}})
+    press(stage, "Measure")
+    assert (texts(stage, ".mode .trouble"), stage.said) == ([], "Measuring.")
+    measured(stage, own)
+    press(stage, "Idle")
+    assert texts(stage, ".mode .trouble") == ["Not now. Later."]
+    stage.answers(**{"DELETE measurements/m": {}, "POST measurements": no})
+    press(stage, "Idle")
+    assert (texts(stage, ".mode .trouble"), stage.said) == ([], "Idle.")
+    measured(stage, own)
+    press(stage, "Measure at 10 Hz")
+    assert texts(stage, ".mode .trouble") == ["Not now. Later."]
+
+
+def test_a_node_in_a_measurement_is_told_by_its_numbers_and_the_three_commonest_reasons(stage: Stage) -> None:
+    nodes(stage, gripper())
+    found = ((2, 1, "late"), (2, 9, "no answer"), (7, 4, "range"), (2, 5, "noise"))
+    why = [{"channel": number, "count": many, "why": word} for number, many, word in found]
+    one = {"uuid": ARM, "state": "running", "samples": 1, "lost": 0}
+    reasons = "opening: no answer; opening: noise; channel 7: range"
+    cases = [
+        ({"state": "running", "nodes": [one]}, "running, 1 sample, none lost."),
+        (
+            {"state": "running", "nodes": [one | {"samples": 0, "lost": 2, "late": 1, "bad": 3}]},
+            "running, 0 samples, 2 lost, 1 late, 3 bad.",
+        ),
+        (
+            {"nodes": [one | {"invalid": 19, "invalid_why": why}]},
+            f"running, 1 sample, none lost, 19 invalid ({reasons}).",
+        ),
+        (
+            {"nodes": [one | {"invalid": 1, "invalid_why": why[:1], "why": "It is late."}]},
+            "running, 1 sample, none lost, 1 invalid. It is late.",
+        ),
+        ({"nodes": [one | {"invalid": 1}]}, "running, 1 sample, none lost, 1 invalid (no reason given)."),
+        ({"nodes": [{"uuid": ARM, "state": "lost", "why": "Silent."}], "why": "else"}, "lost. Silent."),
+        ({"state": "failed", "why": "No room.", "nodes": [{"uuid": HAND}]}, "failed. No room."),
+        ({}, "starting."),
+    ]
+    stage.table(f"values.told(one, '{ARM}').slice(1).join('').trim()", cases)
+    icons = "const d = (one) => one.querySelector('path').getAttribute('d');"
+    same = "words.map(([word, name]) => d(values.told({ state: word }, 'x')[0]) === d(dom.icon(name)))"
+    signs = [("running", "wave"), ("refused", "warn"), ("lost", "warn"), ("waiting", "clock")]
+    assert stage.run(f"{icons} return {same}", *signs) == [True] * 4
+
+
+def test_a_plot_has_buttons_for_its_length_its_pause_and_the_way_back(stage: Stage) -> None:
+    stage.run(
+        """
+        window.plot = show(new plot.LivePlot([]));
+        document.getElementById("main").append(values.plotHead(window.plot, "h4", "Course"), window.plot.element);
+        """
+    )
+    assert texts(stage, ".plot-head > h4") == ["Course"]
+    pressed = (
+        "[...document.querySelectorAll('.switch button')].map((one) => [one.innerText, one.ariaPressed === 'true'])"
+    )
+    names = ["10 s", "30 s", "2 min", "10 min", "1 h"]
+    assert stage.run(f"return {pressed}") == [[name, name == "30 s"] for name in names]
+    for name, seconds in zip(names, (10, 30, 120, 600, 3600), strict=True):
+        press(stage, name)
+        assert stage.run(f"return [{pressed}, window.plot.window]") == [[[one, one == name] for one in names], seconds]
+    state = "const one = document.querySelector('.plot-head > button'); return [one.innerText, one.ariaPressed]"
+    assert stage.run(state) == ["Pause", "false"]
+    press(stage, "Pause")
+    assert (stage.run(state), stage.run("return window.plot.paused !== null")) == (["Resume", "true"], True)
+    press(stage, "Resume")
+    assert (stage.run(state), stage.run("return window.plot.paused")) == (["Pause", "false"], NONE)
+    back = stage.page.get_by_role("button", name="Back to live")
+    assert back.is_hidden()
+    stage.run("window.plot.zoom([1, 2])")
+    assert back.is_visible()
+    press(stage, "Back to live")
+    assert (back.is_hidden(), stage.run("return window.plot.range")) == (True, NONE)
