@@ -16,7 +16,8 @@ from teds_provision.measure.interpreter import NODE_SAYS_SO, StreamInterpreter
 from teds_provision.protocol.operation.commands import NOT_VALID
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.protocol.operation.subscription import StreamMessage, StreamPlan
-from teds_provision.teds.calibration import fit
+from teds_provision.teds.calibration import Calibration, fit
+from teds_provision.teds.calibration.model import CalibrationInput
 from teds_provision.teds.channel import SampleForm
 from tests.teds.test_interpreter import changed, sheet_of
 
@@ -166,3 +167,40 @@ def test_a_test_pattern_has_no_value_and_counts_none_as_invalid() -> None:
     assert np.isnan(block.value).all()
     assert block.raw.tolist() == [[LOW, LOW], [HIGH, LOW], [LOW, LOW]]
     assert heard.invalid == ()
+
+
+def test_a_channel_that_needs_one_of_another_stream_has_raw_values_and_those_beside_it_have_theirs() -> None:
+    inputs = (CalibrationInput(1, 1, (0, 1000), (0,)), CalibrationInput(2, 1, (0, 1000), (0,)))
+    both = Calibration(1, "polynomial", inputs, (0.0, 0.01, 0.001, 0.0), unit=CURVES[1].unit)
+    sheet = sheet_of("tactile-finger-sensor", {**CURVES, 1: both})
+    clock = ClockMap()
+    clock.exchange(Exchange(0, 2000, 500, 1500, 1, 20))
+    why = "Channel 1 is compensated by channel 2, which is not part of the same stream."
+    third = sheet.channels[2].number
+    for numbers, problems in (((1, third), {1: why}), ((1, 2), {})):
+        plan = StreamPlan.for_channels(0, tuple((number, 2) for number in numbers), n=1, period=MS)
+        heard = StreamInterpreter(sheet, plan, 1, clock, HostClock(WallClock(1.8e9)), MonotonicStamps())
+        assert {number: heard.problems[number] for number in heard.problems if number == 1} == problems
+        [block] = heard.blocks([StreamMessage(0, 0, 10**9, 0, struct.pack(">HH", 400, 200))])
+        assert block.raw.tolist() == [[400, 200]]
+        assert block.valid[0, 0] == (not problems)
+        if problems:
+            assert np.isnan(block.value[0, 0])
+            assert reasons(heard.invalid)[1, why.removesuffix(".")] == 1
+        else:
+            np.testing.assert_allclose(block.value, [[2.4, 2.0]], rtol=1e-6)
+
+
+def test_a_channel_behind_one_without_values_has_its_own() -> None:
+    """One that is compensated keeps the others from being computed side by side: each is computed alone."""
+    inputs = (CalibrationInput(2, 1, (0, 1000), (0,)), CalibrationInput(1, 1, (0, 1000), (0,)))
+    both = Calibration(2, "polynomial", inputs, (0.0, 0.01, 0.001, 0.0), unit=CURVES[1].unit)
+    bare = changed(sheet_of("tactile-finger-sensor", {2: both}), calibration=None, units_stated=True)
+    clock = ClockMap()
+    clock.exchange(Exchange(0, 2000, 500, 1500, 1, 20))
+    plan = StreamPlan.for_channels(0, ((1, 2), (2, 2)), n=1, period=MS)
+    heard = StreamInterpreter(bare, plan, 1, clock, HostClock(WallClock(1.8e9)), MonotonicStamps())
+    assert set(heard.problems) == {1}
+    [block] = heard.blocks([StreamMessage(0, 0, 10**9, 0, struct.pack(">HH", 400, 200))])
+    assert block.valid.tolist() == [[False, True]]
+    assert block.value[0, 1] == pytest.approx(4.2)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -558,3 +559,108 @@ def test_what_cyclone_dds_offers_and_asks_for(bare: pytest.MonkeyPatch) -> None:
         ]  # fmt: skip
         assert [policy.Durability.TransientLocal in one for one in (live, last, asked)] == [False, True, False]
         assert sink._header(12.9999999999).stamp == kinds.Time(13, 0)
+
+
+def test_a_python_imports_what_it_can_in_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def run(words: list[str], *, env: dict[str, str], timeout: float, **_how: Any) -> Any:
+        asked.append((words, env, timeout))
+        if words[0] == "/no/python":
+            raise FileNotFoundError
+        if words[0] == "/slow/python":
+            raise subprocess.TimeoutExpired(words, timeout)
+        return SimpleNamespace(returncode=0 if words[0] == "/good/python" else 1)
+
+    monkeypatch.setattr(child.subprocess, "run", run)
+    found = [child.imports(f"/{name}/python", "rospy, a.b", {"A": "1"}) for name in ("good", "bare", "no", "slow")]
+    assert found == [True, False, False, False]
+    assert asked[0] == (["/good/python", "-s", "-c", "import rospy, a.b"], {"A": "1"}, 60.0)
+
+
+class Child:
+    """A process: ``ends`` False if it ends only when it is killed, with all that it started."""
+
+    pid = 4711
+    returncode = 0
+
+    def __init__(self, course: list[Any], *, ends: bool, stdin: Any = None) -> None:
+        self.course, self.ends, self.stdin = course, ends, stdin
+
+    def wait(self, patience: float | None = None) -> None:
+        self.course.append(patience)
+        if patience is not None and not self.ends:
+            raise subprocess.TimeoutExpired("child", patience)
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_child_that_does_not_end_with_its_input_is_killed_with_all_that_it_started(
+    monkeypatch: pytest.MonkeyPatch, gone: bool
+) -> None:
+    course: list[Any] = []
+
+    def kill(group: int, number: int) -> None:
+        course.append((group, number))
+        if gone:
+            raise ProcessLookupError
+
+    monkeypatch.setattr(child.os, "killpg", kill)
+    sink = DeskChildSink()
+    sink._stop(5.0)
+    for ends in (True, False):
+        stdin = SimpleNamespace(close=lambda: course.append("closed"))
+        sink._child = Child(course, ends=ends, stdin=stdin)  # type: ignore[assignment]
+        sink._stop(5.0)
+        assert sink._child is None
+    assert course == ["closed", 5.0, "closed", 5.0, (4711, 9), None]
+
+
+def test_the_last_messages_of_a_ready_child_have_five_seconds_to_leave() -> None:
+    course: list[Any] = []
+    sink = DeskChildSink()
+    for ready in (False, True):
+        if ready:
+            sink._ready.set()
+        sink._child = Child(course, ends=True)  # type: ignore[assignment]
+        sink._finish()
+    assert course == [0.5, 5.0]
+
+
+@pytest.mark.parametrize(
+    ("failure", "why"),
+    [
+        (None, ""),
+        ("full", "rospy takes nothing any more"),
+        (BrokenPipeError, "rospy died"),
+        (BlockingIOError, "rospy died"),
+    ],
+)
+def test_a_child_that_takes_no_line_is_given_up(monkeypatch: pytest.MonkeyPatch, failure: Any, why: str) -> None:
+    """Two seconds without room in its pipe, whatever the state of its process is; a line goes in parts."""
+    waited: list[float] = []
+    got = bytearray()
+
+    def select(_read: Any, write: list[Any], _error: Any, left: float) -> tuple[Any, ...]:
+        waited.append(left)
+        return [], [] if failure == "full" else write, []
+
+    def write(_file: int, octets: memoryview) -> int:
+        if failure:
+            raise failure
+        got.extend(octets[:7])
+        return min(7, len(octets))
+
+    monkeypatch.setattr(child, "select", SimpleNamespace(select=select))
+    monkeypatch.setattr(child.os, "write", write)
+    monkeypatch.setattr(child, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    sink = DeskChildSink()
+    lost: list[str] = []
+    monkeypatch.setattr(sink, "_lost", lost.append)
+    ChildSink._send(sink, op="text")
+    assert waited == [], "there is no child"
+    sink._child = Child([], ends=True, stdin=SimpleNamespace(fileno=lambda: 9))  # type: ignore[assignment]
+    ChildSink._send(sink, op="text", v="ä")
+    assert waited[0] == 2.0
+    assert lost == ([why] if why else [])
+    if not why:
+        assert got == b'{"op":"text","v":"\\u00e4"}\n'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 from types import SimpleNamespace
@@ -282,3 +283,203 @@ def test_a_set_point_is_passed_on_with_all_its_digits_and_a_topic_is_subscribed_
         '{"event": "command", "uuid": "aa", "channel": 3, "value": "0.30000000000000004"}',
         '{"event": "joints", "names": ["a", "b"], "position": ["1.0", "nan"], "velocity": [], "effort": ["2.5"]}',
     ]
+
+
+def as_module(monkeypatch: pytest.MonkeyPatch, module: Any, made: dict[str, Any]) -> list[str]:
+    """Let a child import these packages; returns what it asks for."""
+    asked: list[str] = []
+
+    def load(name: str) -> Any:
+        asked.append(name)
+        return SimpleNamespace(**made)
+
+    monkeypatch.setattr(module, "importlib", SimpleNamespace(import_module=load))
+    return asked
+
+
+class Diagnostics:
+    """A DiagnosticArray."""
+
+    def __init__(self) -> None:
+        self.header, self.status = SimpleNamespace(stamp=Stamp(), frame_id=""), []  # type: ignore[var-annotated]
+
+
+STATUS = {
+    "id": 1,
+    "t": 3.5,
+    "v": [[2, "arm", "It is lost.", "aa", [["lost", "7"], ["late", "0"]]], [0, "x", "", "bb", []]],
+}
+
+
+def test_a_status_goes_to_rospy_with_its_values_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge, publisher = child("rospy", Diagnostics)
+    made = {"DiagnosticStatus": lambda *words: words, "KeyValue": lambda *words: words}
+    asked = as_module(monkeypatch, ros1_child, made)
+    bridge.status(STATUS)
+    (message,) = publisher.sent
+    assert message.header.stamp.sec == 3
+    assert message.status == [
+        (2, "arm", "It is lost.", "aa", [("lost", "7"), ("late", "0")]), (0, "x", "", "bb", []),
+    ]  # fmt: skip
+    assert set(asked) == {"diagnostic_msgs.msg"}
+    bridge.status(STATUS)
+    assert len(asked) == 2, "each type is looked up once"
+
+
+def test_a_status_goes_to_rclpy_with_its_level_as_an_octet(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge, publisher = child("rclpy", Diagnostics)
+    made = {"DiagnosticStatus": lambda **words: words, "KeyValue": lambda **words: words}
+    assert as_module(monkeypatch, rclpy_child, made) == []
+    bridge.status(STATUS)
+    (message,) = publisher.sent
+    assert message.header.stamp.sec == 3
+    values = [{"key": "lost", "value": "7"}, {"key": "late", "value": "0"}]
+    assert message.status == [
+        {"level": b"\2", "name": "arm", "message": "It is lost.", "hardware_id": "aa", "values": values},
+        {"level": b"\0", "name": "x", "message": "", "hardware_id": "bb", "values": []},
+    ]
+
+
+def test_a_text_is_a_message_of_its_own() -> None:
+    bridge, publisher = child("rclpy", SimpleNamespace)
+    bridge.text({"id": 1, "v": "{}"})
+    assert publisher.sent == [SimpleNamespace(data="{}")]
+    bridge, publisher = child("rospy", lambda data: ("String", data))  # type: ignore[arg-type]
+    bridge.text({"id": 1, "v": "{}"})
+    assert publisher.sent == [("String", "{}")]
+
+
+def test_what_rospy_holds_back_or_has_in_its_queues_is_waited_for_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two seconds at most: one for subscribers to come, one for the last messages to leave."""
+    now = [50.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+        if now[0] > 50.5:
+            publisher.connections = 1
+        if now[0] > 51.0:
+            queue.clear()
+
+    monkeypatch.setattr(ros1_child, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    queue = ["a message"]
+    connection = SimpleNamespace(_queue=queue)
+    publisher: Any = Publisher()
+    publisher.impl = SimpleNamespace(connections=[SimpleNamespace(), connection])
+    bridge = ros1_child.Bridge(None, None)
+    bridge.publishers[1] = ros1_child.Outlet(publisher, Float64, 1)
+    bridge.publishers[1].publish("late")
+    bridge.end()
+    assert publisher.sent == ["late"]
+    assert now[0] == pytest.approx(51.0, abs=0.01)
+    queue.append("for a reader that hangs")
+    now[0] = 51.1
+    monkeypatch.setattr(ros1_child.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    bridge.end()
+    assert now[0] == pytest.approx(53.1, abs=0.01)
+    for impl in (None, SimpleNamespace(), SimpleNamespace(connections=[])):
+        publisher.impl = impl
+        assert bridge.publishers[1].sent(), "it was taken back, or nobody reads"
+
+
+class Exit(Exception):
+    """The end of a process, with its code."""
+
+
+def runs(monkeypatch: pytest.MonkeyPatch, module: Any, lines: str) -> list[Any]:
+    """Run a child's program with these lines; returns what its bridge was given, and the code with which it ended."""
+    course: list[Any] = []
+
+    def end(code: int) -> None:
+        raise Exit(code)
+
+    class Bridge:
+        def __init__(self, ros: Any, other: Any) -> None:
+            course.append(("bridge", ros.name, other))
+
+        def param(self, words: dict[str, Any]) -> None:
+            course.append(words["value"])
+
+        def end(self) -> None:
+            course.append("end")
+
+    monkeypatch.setattr(module, "Bridge", Bridge)
+    monkeypatch.setattr(module.os, "_exit", end)
+    monkeypatch.setattr(module.sys, "argv", ["child", "bench"])
+    monkeypatch.setattr(module.sys, "stdin", io.StringIO(lines))
+    monkeypatch.setattr(module.threading, "Thread", lambda target, args=(), daemon=False: SimpleNamespace(
+        start=lambda: course.append(("thread", target, args, daemon))))  # fmt: skip
+    with pytest.raises(Exit) as ended:
+        module.main()
+    return [*course, ended.value.args[0]]
+
+
+LINES = '{"op":"param","value":1}\n{"op":"param","value":2}\n'
+
+
+def test_a_rospy_child_is_a_node_of_the_given_name_until_its_parent_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    course: list[Any] = []
+    core = SimpleNamespace(add_preshutdown_hook=course.append)
+    rospy = SimpleNamespace(
+        name="rospy", core=core, get_name=lambda: "/bench", signal_shutdown=lambda _why: course.append("shut down"),
+        init_node=lambda name, **how: course.append((name, how)),
+    )  # fmt: skip
+    rosgraph = SimpleNamespace(
+        is_master_online=lambda: course.append("online?") or True, Master=lambda name: ["of", name]
+    )
+    monkeypatch.setitem(sys.modules, "rospy", rospy)
+    monkeypatch.setitem(sys.modules, "rosgraph", rosgraph)
+    done = runs(monkeypatch, ros1_child, LINES)
+    assert course == [
+        "online?", ("bench", {"disable_signals": True, "anonymous": False}), ros1_child.leave, "shut down",
+    ]  # fmt: skip
+    assert done == [
+        ("bridge", "rospy", ["of", "/bench"]), ("thread", ros1_child.watch_master, (rosgraph, "/bench"), True),
+        1, 2, "end", 0,
+    ]  # fmt: skip
+    assert capsys.readouterr().out == '{"event": "ready", "node": "/bench"}\n'
+
+
+@pytest.mark.parametrize(("alone", "domain", "ports"), [
+    (True, None, [(7400, 7650), (1, 10_000)]), (True, "3", [(8150, 8400), (1, 10_000)]), (False, "3", []),
+])  # fmt: skip
+def test_an_rclpy_child_is_a_node_of_the_given_name_until_its_parent_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], alone: bool, domain: str | None, ports: Any
+) -> None:
+    """What it listens on is kept on this machine before anything is published."""
+    course: list[Any] = []
+
+    class Executor:
+        def add_node(self, node: Any) -> None:
+            course.append(node.get_name())
+
+        def spin(self) -> None:
+            """Never called here."""
+
+        def shutdown(self, seconds: float) -> None:
+            course.append(seconds)
+
+    node = SimpleNamespace(get_name=lambda: "bench", destroy_node=lambda: course.append("destroyed"))
+    rclpy = SimpleNamespace(
+        name="rclpy", init=lambda: course.append("init"), create_node=lambda name: course.append(name) or node,
+        shutdown=lambda: course.append("shut down"),
+    )  # fmt: skip
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
+    monkeypatch.setitem(sys.modules, "rclpy.executors", SimpleNamespace(SingleThreadedExecutor=Executor))
+    monkeypatch.setattr(rclpy_child, "on_this_machine_alone", lambda: alone)
+    monkeypatch.setattr(rclpy_child, "keep_on_loopback", lambda given: course.append((given.start, given.stop)))
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    if domain is not None:
+        monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    done = runs(monkeypatch, rclpy_child, LINES)
+    assert course == ["init", "bench", *ports, "bench", 1.0, "destroyed", "shut down"]
+    (bridge, (thread, spin, _, daemon), *rest) = done
+    assert (bridge, thread, spin.__name__, daemon, rest) == (
+        ("bridge", "rclpy", node),
+        "thread",
+        "spin",
+        True,
+        [1, 2, 0],
+    )
+    assert capsys.readouterr().out == '{"event": "ready", "node": "bench"}\n'
