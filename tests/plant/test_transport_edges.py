@@ -1,0 +1,824 @@
+"""What stations of a plant do with documents that did not come, came twice, or are none; and whom they answer."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from teds_provision.errors import (
+    BadDataError,
+    LinkError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
+    RosterExpiredError,
+    StoreError,
+    UsageError,
+)
+from teds_provision.handover import incoming
+from teds_provision.plant import (
+    apply_pages,
+    backlog,
+    connecting,
+    evidence,
+    fetching,
+    jobs,
+    membership,
+    parcels,
+    postgres,
+    removed_members,
+    returned,
+    service,
+    sign_requests,
+    sync,
+    verify_evidence,
+    yield_stats,
+)
+from teds_provision.plant.connecting import NotMemberError
+from teds_provision.plant.fetching import take_carried
+from teds_provision.plant.folder_transport import FolderTransport
+from teds_provision.plant.sign_requests import FileOffice, Inbox, JoinedOffice, OfficeOrder, RemoteOffice
+from teds_provision.plant.sync import ForkError
+from teds_provision.plant.transport import CarriedPage, Parcel
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.plant.document import SIGN_REQUEST, NewerFormatError
+from teds_provision.station.plant.alarms import Alarm
+from teds_provision.station.plant.pages import PageRow
+from teds_provision.station.plant.parcels import ParcelRow
+from teds_provision.station.plant.plant import PlantRecord
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import Draft
+from teds_provision.teds.image import Image
+from tests.bench import PASSPHRASE
+
+from .owner import REGISTRY, alone
+
+NODE = bytes.fromhex("8d4d9da65281f7000001")
+WEST = "ee" * 32
+NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("made") / "owner"
+    alone(home).close()
+    return home
+
+
+@pytest.fixture
+def home(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "owner")
+    return tmp_path / "owner"
+
+
+@pytest.fixture
+def station(home: Path) -> Iterator[Station]:
+    with Station.open(home, ask=lambda *_: PASSPHRASE) as opened:
+        yield opened
+
+
+def h(name: str) -> str:
+    return name.encode().hex().rjust(64, "0")
+
+
+def raises(error: Exception) -> Callable[..., Any]:
+    def raised(*_: Any, **__: Any) -> Any:
+        raise error
+
+    return raised
+
+
+def stub(**members: Any) -> Any:
+    return SimpleNamespace(**members)
+
+
+# -- documents of a line -----------------------------------------------------------------------------------------------
+
+
+def test_without_a_way_to_others_nothing_is_sent(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(PolicyError) as error:
+        sign_requests.transport_for(station, None)
+    assert (error.value.message, error.value.hint) == (
+        "This station has no way to reach the other stations.", "Give a transfer folder: --files DIR"
+    )  # fmt: skip
+    assert sign_requests.transport_for(station, tmp_path).where == str(tmp_path)
+    monkeypatch.setattr(connecting, "open_transport", lambda _: "the registry")
+    assert cast("str", sign_requests.transport_for(station, None)) == "the registry"
+    sent = list[Parcel]()
+    with pytest.raises(PolicyError) as error:
+        sign_requests.send(station, stub(send=sent.append), WEST, b"document", "name")
+    assert (error.value.message, error.value.hint) == (
+        f"Station {WEST[:16]} is not a member of the plant.", "See: registry status"
+    )  # fmt: skip
+    assert sent == []
+
+
+def test_an_inbox_gives_each_document_once_until_it_is_dropped(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there, gone = [Parcel("p2", "", b"{two", ""), Parcel("p3", "", b"junk", "")], list[tuple[str, str]]()
+    asked = list[set[str]]()
+
+    def new_parcels(own: str, known: set[str]) -> list[Parcel]:
+        asked.append(set(known))
+        return [parcel for parcel in there if parcel.id not in known]
+
+    transport = stub(new_parcels=new_parcels, drop=lambda parcel, to: gone.append((parcel, to)))
+    with station.transaction():
+        for name, kind in (("p1", "sign-request"), ("p0", "job")):
+            row = ParcelRow(name, "in", WEST, cast("Any", kind), "waiting", "2099-01-01T00:00:00Z")
+            station.plant.parcels.put(row, name.encode())
+    inbox = Inbox(station, transport, SIGN_REQUEST)
+    monkeypatch.setattr(inbox, "_opened", lambda octets: octets if octets.startswith(b"{") else None)
+    first = inbox.collect()
+    assert [come.document for come in first] == [b"p1", b"{two"]
+    assert inbox.collect() == []
+    assert asked == [{"p1"}, {"p1", "p2", "p3"}]
+    first[0].drop()
+    first[1].drop()
+    assert gone == [("p2", station.fingerprint)]
+    assert station.plant.parcels.get("p1", "in") is None
+    there[:] = [Parcel("p2", "", b"{again", "")]
+    assert [come.document for come in inbox.collect()] == [b"{again"], "a repeated request has the same id"
+    inbox.start_over()
+    assert [come.document for come in inbox.collect()] == [b"{again"], "all that is there, once more"
+
+
+def test_an_inbox_waits_for_a_notification_and_without_one_looks_again(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, sleeps = list[Any](), list[float]()
+    listener = stub(
+        listen=lambda: done.append("listen"), close=lambda: done.append("close"),
+        interrupt=lambda: done.append("interrupt"),
+        wait=lambda seconds, parcel_to: done.append((seconds, parcel_to)),
+    )  # fmt: skip
+    found = [listener]
+    monkeypatch.setattr(sign_requests, "time", stub(sleep=sleeps.append))
+    monkeypatch.setattr(connecting, "listener", lambda _: found[0])
+    transport = postgres.PostgresTransport(cast("Any", None), "office", station.fingerprint)
+    inbox = Inbox(station, transport, SIGN_REQUEST)
+    inbox.interrupt()
+    inbox.close()
+    assert done == []
+    inbox.wait(1.0, 0.2)
+    assert done == ["listen"], "what came before the first listen causes no notification"
+    inbox.wait(1.5, 0.2)
+    inbox.interrupt()
+    assert done == ["listen", (1.5, station.fingerprint), "interrupt"]
+    listener.wait = raises(LinkError("The server is gone."))
+    inbox.wait(1.0, 0.2)
+    assert (done[3:], sleeps) == (["close"], [0.2])
+    inbox.wait(0.1, 0.2)
+    assert sleeps == [0.2, 0.1], "no longer than asked"
+    inbox.start_over()
+    inbox.wait(1.0, 0.2)
+    inbox.start_over()
+    assert done[4:] == ["listen", "close"]
+    found[0] = None
+    inbox.wait(1.0, 0.2)
+    assert (done[6:], sleeps) == ([], [0.2, 0.1, 0.2]), "a folder notifies nobody"
+    folder = Inbox(station, cast("Any", stub()), SIGN_REQUEST)
+    folder.wait(3.0, 0.2)
+    assert sleeps == [0.2, 0.1, 0.2, 0.2]
+
+
+def test_what_an_inbox_cannot_open_is_for_nobody(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    station.unlock()
+    inbox = Inbox(station, cast("Any", None), SIGN_REQUEST)
+    header = {"typ": SIGN_REQUEST.typ}
+    monkeypatch.setattr(sign_requests.jose, "decrypt", lambda *_, **__: b"head.rest.sign")
+    monkeypatch.setattr(sign_requests, "decode_base64url", lambda text, _: text)
+    monkeypatch.setattr(sign_requests, "load_object", lambda _octets, _what: header)
+    assert inbox._opened(b"{sealed") == b"head.rest.sign"
+    assert inbox._opened(b"sealed") is None
+    header["typ"] = "JOSE"
+    assert inbox._opened(b"{sealed") is None
+    header["typ"] = SIGN_REQUEST.typ
+    for error in (BadDataError("x"), NotAuthenticError("x"), PolicyError("x")):
+        monkeypatch.setattr(sign_requests.jose, "decrypt", raises(error))
+        assert inbox._opened(b"{sealed") is None
+
+
+def test_an_office_signs_for_a_job_that_names_it(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    def order(job: str | None = "0b5f", by: str = "owner") -> OfficeOrder:
+        return OfficeOrder(NODE.hex(), by, job, None, None, None)
+
+    office = [station.fingerprint]
+    monkeypatch.setattr(sign_requests, "find_job", lambda _s, text: stub(id="job", title="cells", office=office[0]))
+    cases = [
+        (UsageError, order(None), "An office only signs for a job.",
+         "Name it: --job ID; see: teds-provision job list"),
+        (PolicyError, order(by="nobody"), "The job “cells” names another office than nobody.", ""),
+        (NotFoundError, order(), f"Nothing has been built for node {NODE.hex()}.",
+         f"To build it: teds-provision build {NODE.hex()}"),
+    ]  # fmt: skip
+    for kind, asked, message, hint in cases:
+        with pytest.raises(kind) as error:
+            sign_requests.sign_by_office(station, cast("Any", None), asked, cast("Any", None))
+        assert (error.value.message, error.value.hint) == (message, hint)
+    office[0] = WEST
+    with pytest.raises(PolicyError, match="names another office than owner"):
+        sign_requests.sign_by_office(station, cast("Any", None), order(), cast("Any", None))
+
+
+def test_a_draft_is_signed_over_a_file_or_a_transport_and_kept(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station.unlock()
+    image, signed = Image(NODE, {(0, 1): b"meta"}), Image(NODE, {(0, 1): b"meta", (0, 16): b"security"})
+    with station.transaction():
+        station.datasheets.keep_draft(Draft(NODE, image, "built", "load-cell"))
+    job = stub(id="job", title="cells", office=station.fingerprint)
+    visit = stub(node="node", who=stub(point=b"point", key_signature=b"signature"))
+    ways, closed = list[object](), list[str]()
+
+    class Visit:
+        def __enter__(self) -> Any:
+            return visit
+
+        def __exit__(self, *_: object) -> None:
+            closed.append("node")
+
+    def by_office(_station: Any, way: Any, node: Any, keys: Any, wanted: Any, on_node: Any) -> Any:
+        ways.append(way)
+        assert (node, keys.uuid, keys.key, on_node) == ("node", NODE, b"point", None)
+        assert (wanted.job, wanted.office, wanted.image, wanted.name) == ("job", station.fingerprint, image, "cell 1")
+        assert (wanted.calibration, wanted.epoch, wanted.sequence, wanted.profile) == (b"raw", 3, 9, "load-cell")
+        return stub(image=signed)
+
+    monkeypatch.setattr(sign_requests, "find_job", lambda *_: job)
+    monkeypatch.setattr(sign_requests, "at_node", lambda *_, **__: Visit())
+    monkeypatch.setattr(sign_requests, "require_session", lambda *_: None)
+    monkeypatch.setattr(sign_requests, "read_identity", lambda _: stub(epoch=3, sequence=9))
+    monkeypatch.setattr(sign_requests, "own_name", lambda *_: "cell 1")
+    monkeypatch.setattr(sign_requests, "by_office", by_office)
+    (tmp_path / "cal.csv").write_bytes(b"raw")
+    (tmp_path / "stick").mkdir()
+    monkeypatch.setattr(FolderTransport, "close", lambda _: closed.append("transport"))
+    for output in (tmp_path / "request.jws", None):
+        order = OfficeOrder(NODE.hex(), "owner", "0b5f", tmp_path / "cal.csv", tmp_path / "stick", output)
+        done = sign_requests.sign_by_office(station, cast("Any", stub(timeout=2.5)), order, cast("Any", None))
+        assert done.image is signed
+        draft = station.datasheets.draft(NODE)
+        assert draft is not None
+        assert (draft.image, draft.stage, draft.profile) == (signed, "signed", "load-cell")
+        with station.transaction():
+            station.datasheets.keep_draft(Draft(NODE, image, "built", "load-cell"))
+    assert ways[0] == FileOffice(tmp_path / "request.jws")
+    assert isinstance(ways[1], RemoteOffice)
+    assert ways[1].timeout == 2.5
+    assert closed == ["node", "node", "transport"]
+
+
+def test_a_board_that_signs_with_another_key_gets_no_request(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    station.unlock()
+    wanted = stub(image=Image(NODE, {(0, 1): b"meta"}), epoch=1, sequence=2, office=station.fingerprint, job="job")
+    keys = stub(uuid=NODE, key=SoftwareKey(5).point)
+    node = stub(request_idempotent=lambda _command, what: SoftwareKey(6).sign(what.encode()))
+    with pytest.raises(NotAuthenticError) as error:
+        sign_requests._new_request(station, node, keys, wanted)
+    assert error.value.message == "The node's signature of the request does not match the key it presented."
+    claim = stub(challenge=lambda nonce: bytes(32), teds=b"", uuid=NODE)
+    monkeypatch.setattr(evidence.security, "decode", lambda _: stub(node_key=SoftwareKey(5).point))
+    with pytest.raises(NotAuthenticError) as error:
+        evidence.prove_claim(node, claim, bytes(16))
+    assert error.value.message == "The node's signature of the evidence does not match the key it presented."
+
+
+def test_a_request_goes_to_the_place_that_is_joined_now(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    places, opened, closed = ["one", "one", "two", "two"], list[str](), list[str]()
+
+    def transport_for(_station: Any, folder: Any) -> Any:
+        assert folder is None
+        name = f"transport {len(opened) + 1}"
+        opened.append(name)
+        return stub(name=name, close=lambda: closed.append(name))
+
+    monkeypatch.setattr(connecting, "place_of", lambda _: places.pop(0))
+    monkeypatch.setattr(sign_requests, "transport_for", transport_for)
+    monkeypatch.setattr(RemoteOffice, "request_signature", lambda office, request: (office.transport.name, request))
+    joined = JoinedOffice(station, 2.0)
+    asked = [cast("Any", joined).request_signature(request) for request in "abc"]
+    assert asked == [("transport 1", "a"), ("transport 2", "b"), ("transport 2", "c")]
+    joined.close()
+    assert closed == ["transport 1", "transport 2"]
+
+
+def test_jobs_that_a_sync_brought_are_taken_or_reported(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    results: dict[bytes, Exception | None] = {
+        b"1": None, b"2": BadDataError("It is damaged."), b"3": NotAuthenticError("Nobody signed it."),
+        b"4": PolicyError("Another job has its id."), b"5": RosterExpiredError("The roster expired."), b"6": None,
+    }  # fmt: skip
+    taken, notices = list[bytes](), list[str]()
+
+    def take_job(_station: Station, octets: bytes) -> None:
+        taken.append(octets)
+        if (error := results[octets]) is not None:
+            raise error
+
+    monkeypatch.setattr(jobs, "take_job", take_job)
+    monkeypatch.setattr(station, "notice", notices.append)
+    with station.transaction():
+        for octets in results:
+            row = ParcelRow(
+                octets.decode(), "in", WEST, "job", "waiting", "2099-01-01T00:00:00Z", created=octets.decode()
+            )
+            station.plant.parcels.put(row, octets)
+    jobs.take_received(station)
+    assert taken == [b"1", b"2", b"3", b"4", b"5"]
+    assert [row.id for row in station.plant.parcels.all("in", "waiting")] == ["5", "6"], "a renewed roster decides"
+    assert notices == [
+        "A received job was rejected: It is damaged.", "A received job was rejected: Nobody signed it.",
+        "A received job was rejected: Another job has its id.",
+    ]  # fmt: skip
+
+
+# -- pages -------------------------------------------------------------------------------------------------------------
+
+
+def test_only_a_fork_of_this_station_waits_for_a_decision(station: Station) -> None:
+    me = station.fingerprint
+    for code, about in (("junk", me), ("fork", WEST), ("two-histories", me)):
+        with station.transaction():
+            station.plant.alarms.put(Alarm(code, about, 3, "why"))
+        sync._require_resumed(station)
+    with station.transaction():
+        station.plant.alarms.put(Alarm("fork", me, 5, "pages of another home"))
+    with pytest.raises(ForkError) as error:
+        sync._require_resumed(station)
+    assert (error.value.message, error.value.hint) == (
+        "Pages under this station's key that this home did not write were found, from number 5 on, and the decision is"
+        " still open.",
+        "Find out who has a copy; if in doubt, have this station removed. Then: teds-provision registry resume",
+    )
+
+
+def test_a_folder_gets_each_page_once_and_a_registry_its_own_alone(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    me = station.fingerprint
+    with station.transaction():
+        for of, numbers in ((me, (1, 2, 3)), (WEST, (1,))):
+            chain = station.plant.pages.chain(of)
+            for n in numbers:
+                station.plant.pages.add(
+                    chain.id, PageRow(n, h(f"{of[:4]}{n}"), h(f"{of[:4]}{n - 1}"), "", "", b"", b"", bytes(64))
+                )
+    monkeypatch.setattr(sync, "octets_of", lambda row: row.hash.encode())
+    monkeypatch.setattr(sync, "hash_of", lambda octets: octets.decode())
+    monkeypatch.setattr(sync, "counted_places", lambda *_: {(1, h(f"{me[:4]}1")), (3, h(f"{me[:4]}3"))})
+
+    def pushed(*, folder: bool, there: dict[str, list[str]], heads: dict[str, int]) -> tuple[list[str], int]:
+        sent = list[str]()
+
+        def append(of: str, n: int, previous: str, hash: str, octets: bytes) -> None:
+            assert (previous, octets) == (h(f"{of[:4]}{n - 1}"), hash.encode())
+            sent.append(hash)
+
+        pages = lambda of, after: [CarriedPage(of, 1, hash.encode()) for hash in there.get(of, ())]  # noqa: E731
+        done = stub(pushed=0)
+        transport = stub(carries_all=folder, heads=lambda: heads, pages=pages, append=append)
+        sync._push(station, transport, cast("Any", None), cast("Any", done), connected=False)
+        return sent, done.pushed
+
+    mine, wests = [h(f"{me[:4]}{n}") for n in (1, 2, 3)], h("eeee1")
+    assert pushed(folder=True, there={}, heads={me: 9}) == ([*mine, wests], 3)
+    assert pushed(folder=True, there={me: mine[:2], WEST: [wests]}, heads={}) == ([mine[2]], 1)
+    assert pushed(folder=True, there={me: mine, WEST: ["other"]}, heads={}) == ([wests], 0)
+    assert pushed(folder=False, there={}, heads={}) == ([mine[0], mine[2]], 2), "a page that was given up stays here"
+    assert pushed(folder=False, there={}, heads={me: 1}) == ([mine[2]], 1)
+    assert pushed(folder=False, there={me: []}, heads={me: 3}) == ([], 0)
+
+
+def test_events_of_pages_that_were_given_up_are_stated_again(station: Station) -> None:
+    station.unlock()
+    names = [digit * 16 for digit in "1234"]
+    events = [{"id": name, "act": "closed", "job": "j"} for name in names]
+    chain = station.plant.pages.chain(station.fingerprint)
+    with station.transaction():
+        content = json.dumps({"events": events[:3]}).encode()
+        station.plant.pages.add(chain.id, PageRow(4, h("h4"), "", "", "", b"", content, bytes(64)))
+    new = [stub(events=["none", {"id": names[1]}]), stub(events=())]
+    with station.transaction():
+        sync._report_again(station, chain, [(4, h("h4")), (5, h("lost"))], cast("Any", new))
+    assert [id for _, id, _ in station.plant.outbox(9)] == [names[0], names[2]]
+
+
+def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:
+    for registry in (None, REGISTRY):
+        transport = stub(
+            registry=lambda r=registry: r, rosters=lambda: iter(()), post_roster=lambda *_: None, where="office"
+        )  # fmt: skip
+        found = sync._rosters(station, transport, cast("Any", stub(rosters=[])))
+        assert found == []
+    with pytest.raises(PolicyError) as error:
+        sync._rosters(station, stub(registry=lambda: "another", where="office"), cast("Any", None))
+    assert (error.value.message, error.value.hint) == (
+        "office belongs to another registry (another).", "Use the one that this station joined."
+    )  # fmt: skip
+
+
+def test_pages_that_count_are_handed_in_before_all_others(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    chain = station.plant.pages.chain(WEST)
+    with station.transaction():
+        for n, hash in ((1, "a"), (2, "b"), (2, "c"), (3, "d")):
+            station.plant.pages.add(chain.id, PageRow(n, h(hash), "", "", "", b"", b"", bytes(64)))
+    monkeypatch.setattr(returned, "octets_of", lambda row: bytes.fromhex(row.hash)[-1:])
+    monkeypatch.setattr(returned, "counted_places", lambda *_: {(1, h("a")), (2, h("c"))})
+    digest = {hash: hashlib.sha256(hash.encode()).hexdigest() for hash in "abcd"}
+
+    def lacking(*there: tuple[int, str]) -> list[tuple[int, bytes]]:
+        return list(returned._lacking(station, cast("Any", None), chain, there))
+
+    assert lacking() == [(1, b"a"), (2, b"c"), (2, b"b"), (3, b"d")]
+    assert lacking((1, digest["a"]), (3, digest["c"]), (2, digest["b"])) == [(2, b"c"), (3, b"d")]
+
+
+def test_pages_are_read_up_to_one_of_a_newer_format(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Junk among them is passed over; what follows none that is here is left."""
+    batches, junk = list[list[int]](), list[int]()
+
+    def opened(carried: CarriedPage, _roster: Any, author: str) -> Any:
+        assert author == WEST
+        if carried.octets == b"newer":
+            raise NewerFormatError("a page of format 2")
+        if carried.octets == b"junk":
+            raise NotAuthenticError("no signature")
+        return stub(number=carried.number, hash=carried.octets.decode(), events=[1] * 3)
+
+    monkeypatch.setattr(fetching, "open_carried", opened)
+    monkeypatch.setattr(fetching, "hash_of", lambda octets: octets.decode())
+    monkeypatch.setattr(fetching, "EVENTS_AT_ONCE", 6)
+    take_pages = lambda _s, _r, batch: batches.append([page.number for page in batch])  # noqa: E731
+    monkeypatch.setattr(fetching, "take_pages", take_pages)
+
+    def taken(*octets: bytes, first: int = 1) -> Any:
+        batches.clear()
+        pages = [CarriedPage(WEST, n, each) for n, each in enumerate(octets, first)]
+        return take_carried(station, cast("Any", None), WEST, pages, lambda carried: junk.append(carried.number))
+
+    done = taken(b"p1", b"p2", b"p3", b"p4", b"p5")
+    assert (done.pages, done.waits, batches) == (5, None, [[1, 2], [3, 4], [5]])
+    done = taken(b"p1", b"newer", b"p3")
+    assert (done.pages, bool(done.waits), batches) == (1, True, [[1]])
+    done = taken(b"p1", b"junk", b"p3")
+    assert (done.pages, [carried.number for carried in done.junk], junk, batches) == (1, [2], [2], [[1]])
+    assert taken(b"p7", first=7).pages == 0
+    good, bad = fetching.read_pages(
+        [CarriedPage(WEST, 1, b"p1"), CarriedPage(WEST, 2, b"junk")], cast("Any", None), WEST
+    )
+    assert ([page.number for page in good], bad) == ([1], [2])
+    with pytest.raises(NewerFormatError):
+        fetching.read_pages([CarriedPage(WEST, 1, b"junk"), CarriedPage(WEST, 2, b"newer")], cast("Any", None), WEST)
+
+
+def test_a_ban_is_lifted_by_its_signer_or_a_keeper(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    keeper, base = "aa" * 32, "bb" * 32
+    roles = {keeper: frozenset({"keeper"}), base: frozenset({"base"})}
+    roster = stub(
+        point_of=lambda kid: b"member" if kid in roles else None, roles_of=lambda of: roles.get(of, frozenset())
+    )
+    points = {"trusted": b"trusted"}
+    lifters = list[str]()
+    monkeypatch.setattr(apply_pages, "require_roster", lambda _: roster)
+    monkeypatch.setattr(station.plant.claims, "lifters", lambda hash: lifters if hash == "H" else [])
+    monkeypatch.setattr(station.policy, "station_points", lambda: points)
+
+    def opened(statement: str, find: Callable[[str], bytes | None]) -> Any:
+        if find(statement) is None:
+            raise NotAuthenticError("a stranger signed it")
+        return stub(sender=statement)
+
+    monkeypatch.setattr(apply_pages, "open_revocation", opened)
+
+    def lifted(signer: str, *by: str) -> bool:
+        lifters[:] = by
+        return apply_pages._is_lifted(station, signer, "H")
+
+    assert [lifted(base), lifted(base, base), lifted(base, keeper), lifted(keeper, base)] == [False, True, True, False]
+    assert lifted("trusted", "trusted"), "a station that a person trusts"
+    assert lifted(station.fingerprint, base, station.fingerprint), "this station"
+    assert not lifted("stranger", "stranger", keeper)
+
+
+def test_removals_are_known_from_rosters_that_the_ca_signed(station: Station) -> None:
+    held = station.plant.roster
+    assert held is not None
+    assert removed_members._removals_in(held.octets, station.ca) == (held.created, frozenset())
+    never = datetime.max.replace(tzinfo=UTC), frozenset()
+    assert removed_members._removals_in(b"a proof of two rosters", station.ca) == never
+
+
+def test_nodes_are_looked_through_so_many_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(removed_members, "_PAGE", 2)
+
+    def pages(*numbers: int) -> list[list[bytes]]:
+        names = [(bytes([number]) * 10, "k", 1, "active") for number in numbers]
+        keys = stub(all_key_names=lambda: iter(names))
+        return list(removed_members._pages(cast("Any", stub(keys=keys))))
+
+    one, two, three = (bytes([number]) * 10 for number in (1, 2, 3))
+    assert pages() == []
+    assert pages(1, 2, 1, 3, 2) == [[one, two], [three]], "each node once"
+    assert pages(1, 2) == [[one, two]]
+
+
+# -- folder and database -----------------------------------------------------------------------------------------------
+
+
+def test_a_folder_that_cannot_be_used_is_named_with_its_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    transport = FolderTransport(tmp_path)
+    transport.send(Parcel("11111111-2222-4333-8444-555555555555", "me", b"one", ""))
+    (tmp_path / "to" / "me" / "readme.txt").write_bytes(b"two")
+    link = tmp_path / "to" / "me" / "21111111-2222-4333-8444-555555555555"
+    link.symlink_to(tmp_path / "to" / "me" / "readme.txt")
+    found = list(transport.parcels("me"))
+    assert [(parcel.id[:2], parcel.octets) for parcel in found] == [("11", b"one")]
+    assert list(transport.new_parcels("me", {found[0].id})) == []
+    transport.drop(found[0].id, "me")
+    transport.drop(found[0].id, "me")
+    assert list(transport.parcels("me")) == []
+    full = OSError(errno.EIO, "Input/output error")
+    calls: list[tuple[str, Callable[[], object]]] = [
+        ("unlink", lambda: transport.drop("x", "me")),
+        ("iterdir", lambda: list(transport.parcels("me"))),
+        ("mkdir", lambda: transport.send(Parcel("x", "you", b"", ""))),
+    ]
+    for method, call in calls:
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, method, raises(full))
+            with pytest.raises(LinkError) as error:
+                call()
+        assert (error.value.message, error.value.hint) == (
+            f"Cannot use folder {tmp_path}: Input/output error.", "Check its owner, its mode and the free space."
+        )  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", raises(NotADirectoryError()))
+        assert list(transport.parcels("me")) == []
+    (tmp_path / "to" / "me" / "31111111-2222-4333-8444-555555555555").write_bytes(b"three")
+    monkeypatch.setattr("teds_provision.plant.folder_transport.read_limited", raises(LinkError("It cannot be read.")))
+    with pytest.raises(LinkError, match="It cannot be read"):
+        list(transport.parcels("me"))
+
+
+def test_a_transport_follows_from_what_was_joined(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def at(url: str | None) -> None:
+        with station.transaction():
+            station.plant.put_record(PlantRecord(REGISTRY, url=url))
+
+    assert (connecting.open_transport(station), connecting.listener(station)) == (None, None)
+    at(f"{membership.FILES}{tmp_path}")
+    found = connecting.open_transport(station)
+    assert isinstance(found, FolderTransport)
+    assert (found.where, connecting.listener(station)) == (str(tmp_path), None)
+    assert connecting.check_database(station, found) == []
+    at("postgresql://office/plant")
+    for asked in (connecting.open_transport, connecting.listener):
+        with pytest.raises(NotMemberError) as error:
+            asked(station)
+        assert (error.value.message, error.value.hint) == (
+            "This station has no database login yet.",
+            "To get one: registry request --output FILE; the database's administrator then runs: registry"
+            " sql --member FILE | psql",
+        )
+    monkeypatch.setattr(station.plant, "login", lambda: ("key", "verifier"))
+    monkeypatch.setattr(postgres, "parameters", lambda url, digits, key: {"url": url, "key": key})
+    opened = connecting.open_transport(station)
+    assert isinstance(opened, postgres.PostgresTransport)
+    listened = connecting.listener(station)
+    assert listened is not None
+    assert listened._told == {"url": "postgresql://office/plant", "key": "key"}
+
+
+def test_open_doors_of_a_database_are_kept_with_the_logins_of_removed_stations(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    swept, doors, logins = list[bool](), ["public may create"], [WEST, station.fingerprint]
+    transport = postgres.PostgresTransport(cast("Any", None), "office", station.fingerprint)
+    for name, given in (("sweep", lambda: swept.append(True)), ("open_doors", lambda: list(doors)),
+                        ("open_logins", lambda: logins)):  # fmt: skip
+        monkeypatch.setattr(transport, name, given)
+    roster = stub(removed=(stub(fingerprint=WEST, name="west"), stub(fingerprint="cc" * 32, name="south")))
+    monkeypatch.setattr(type(station.plant), "roster", roster)
+    found = connecting.check_database(station, transport)
+    assert found == ["public may create", "login of west, which was removed"]
+    assert (station.plant.doors(), swept) == (found, [True])
+    doors.clear()
+    logins.clear()
+    assert connecting.check_database(station, transport) == station.plant.doors() == []
+
+
+def test_a_database_needs_its_driver_and_a_schema_that_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Missing:
+        @property
+        def conninfo(self) -> Any:
+            raise ImportError("psycopg")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(postgres, "psycopg", Missing())
+        with pytest.raises(UsageError) as error:
+            postgres.require_driver()
+    assert error.value.message == "A registry on PostgreSQL needs psycopg, which is not installed."
+    assert error.value.hint.startswith("Install it: ")
+    assert "[registry]" in error.value.hint
+    registry = postgres.Registry({})
+    rows = list[Any]()
+    monkeypatch.setattr(registry, "_rows", lambda *_: rows)
+    with pytest.raises(StoreError) as failed:
+        registry.look()
+    assert (failed.value.message, failed.value.hint) == (
+        "The database does not contain a registry.", "Ask its administrator to run: registry sql | psql"
+    )  # fmt: skip
+    rows.append(("meta", None, 3, REGISTRY))
+    with pytest.raises(StoreError) as failed:
+        registry.look()
+    assert (failed.value.message, failed.value.hint) == (
+        "The database has schema 3; this program knows 2.", "Use a newer version of teds-provision."
+    )  # fmt: skip
+    rows[0] = ("meta", None, 2, REGISTRY)
+    assert registry.look().registry == REGISTRY
+
+
+# -- parcels -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_station_without_a_roster_takes_and_sends_nothing(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(station.plant), "roster", None)
+    untouched: Any = stub()
+    assert parcels.take_in(station, untouched, untouched, NOW) == parcels.ParcelCounts(0, 0)
+    assert parcels.send_out(station, untouched, untouched, NOW) == parcels.SentParcels(0)
+    assert list(yield_stats._of_pages(station, "job")) == []
+
+
+def test_a_parcel_that_waited_for_pages_is_judged_once_more(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    station.unlock()
+    refused, imported = list[object](), list[str]()
+    held = station.plant.roster
+    assert held is not None
+    reader = parcels._Reader(station, held, cast("Any", None), NOW)
+    monkeypatch.setattr(parcels, "refuse_bundle", lambda _station, error: refused.append(error))
+    monkeypatch.setattr(parcels, "import_parcel", lambda _station, row, plan: imported.append(row.id))
+    monkeypatch.setattr(reader, "_why_not", lambda plan: plan)
+    nothing = incoming.NothingImportedError(
+        cast("Any", stub(id="b", sender=WEST)), (stub(node=stub(uuid=NODE), why="x"),)
+    )
+
+    def judged(plan: Any) -> tuple[bool, str | None, str]:
+        row = ParcelRow("p", "in", WEST, "bundle", "later", "2099-01-01T00:00:00Z")
+        with station.transaction():
+            station.plant.parcels.put(row, b"document")
+        answer = plan if isinstance(plan, Exception) else None
+        monkeypatch.setattr(incoming, "plan_import", raises(answer) if answer else lambda *_: plan)
+        done = reader.judge_again(row)
+        kept = station.plant.parcels.get("p", "in")
+        return done, kept.state if kept is not None else None, kept.detail if kept is not None else ""
+
+    assert judged(nothing) == (True, None, "")
+    assert refused == [nothing]
+    assert judged(BadDataError("It is damaged.")) == (True, None, "")
+    assert refused == [nothing], "its sender is not answered"
+    assert judged("its sender is not a member") == (False, "waiting", "its sender is not a member")
+    assert (judged("")[0], imported) == (True, ["p"])
+    taken = incoming.ImportResult.__new__(incoming.ImportResult)
+    assert (judged(taken)[0], imported) == (True, ["p", "p"])
+
+
+def test_a_failure_that_is_not_the_parcels_fault_throws_nothing_away(station: Station) -> None:
+    station.unlock()
+    held = station.plant.roster
+    assert held is not None
+    reader = parcels._Reader(station, held, cast("Any", None), NOW)
+    parcel = Parcel("p", station.fingerprint, b"{}", "2099-01-01T00:00:00Z", WEST)
+    with pytest.raises(StoreError, match="no space"):
+        reader._junk(parcel, StoreError("There is no space."))
+    for error, alarms in (
+        (NotFoundError("unknown bundle"), 0),
+        (PolicyError("too late"), 0),
+        (BadDataError("cut."), 1),
+    ):
+        assert reader._junk(parcel, error)
+        assert len(station.plant.alarms.all()) == alarms
+    [alarm] = station.plant.alarms.all()
+    assert (alarm.code, alarm.about, alarm.why) == ("parcel", WEST, "a parcel was discarded: cut")
+
+
+# -- evidence, jobs, vouching ------------------------------------------------------------------------------------------
+
+
+def test_a_file_of_evidence_that_cannot_be_read_is_judged_with_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bad.json").write_bytes(b"none")
+    grounds: Any = stub(faults_of=lambda *_: [])
+    bad, missing = verify_evidence.judge_files(grounds, [str(tmp_path / "bad.json"), str(tmp_path / "none.json")])
+    assert (bad.file, bad.evidence, isinstance(bad.error, BadDataError)) == (str(tmp_path / "bad.json"), None, True)
+    assert (missing.good, isinstance(missing.error, NotFoundError)) == (False, True)
+
+
+def test_evidence_that_another_station_writes_at_once_keeps_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_new, taken = evidence.write_new, {3}
+
+    def raced(path: Path, octets: bytes, *, mode: int) -> None:
+        if path.name == "x.2.json":
+            path.write_bytes(b"of another station")
+        write_new(path, octets, mode=mode)
+
+    monkeypatch.setattr(evidence, "write_new", raced)
+    assert evidence._new_file(tmp_path, "x", 2, taken, b"mine") == tmp_path / "x.4.json"
+    assert (tmp_path / "x.2.json").read_bytes() == b"of another station"
+    assert (tmp_path / "x.4.json").read_bytes() == b"mine"
+    assert evidence._new_file(tmp_path, "x", 2, taken, None) == tmp_path / "x.5.json"
+    assert taken == {2, 3, 4, 5}
+
+
+def test_a_datasheet_that_cannot_be_read_is_in_no_backlog(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = {b"good": stub(signed=True, station_key=station.point, key_epoch=3, sequence=7),
+             b"other": stub(signed=True, station_key=b"other", key_epoch=3, sequence=8),
+             b"unsigned": stub(signed=False, station_key=station.point, key_epoch=3, sequence=9)}  # fmt: skip
+
+    def decode(octets: bytes) -> Any:
+        if octets not in shown:
+            raise BadDataError("damaged")
+        return shown[octets]
+
+    images = [
+        stub(image=stub(security=octets)) for octets in (b"damaged", b"other", b"unsigned", None, b"good", b"good")
+    ]
+    monkeypatch.setattr(backlog.security, "decode", decode)
+    monkeypatch.setattr(backlog, "signature_good", lambda *_: True)
+    monkeypatch.setattr(station.datasheets, "history", lambda _: images)
+    assert list(backlog.signed_here(station, NODE)) == [(3, 7, hashlib.sha256(b"good").hexdigest())]
+
+
+def test_a_keeper_vouches_for_authentic_datasheets_of_who_may_not_sign(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uuids = [bytes([number]) * 10 for number in range(7)]
+    gone, member = SoftwareKey(31), SoftwareKey(32)
+    shown = {b"damaged": None, b"unsigned": stub(station_key=None), b"members": stub(station_key=member.point),
+             b"false": stub(station_key=gone.point), b"gone": stub(station_key=gone.point)}  # fmt: skip
+    octets = [None, *shown, b"absent"]
+    roster = stub(has=lambda digits, role: (digits, role) == (fingerprint(member.point), "sign"))
+
+    def decode(of: bytes) -> Any:
+        if shown[of] is None:
+            raise BadDataError("damaged")
+        return shown[of]
+
+    images = {uuid: stub(security=each) for uuid, each in zip(uuids, octets, strict=True) if each != b"absent"}
+    monkeypatch.setattr(membership, "require_roster", lambda _: roster)
+    monkeypatch.setattr(membership.security, "decode", decode)
+    monkeypatch.setattr(membership, "verify_image", lambda _trust, image: (image,))
+    verdict = lambda _uuid, checks: stub(verdict="authentic" if checks[0].security != b"false" else "changed")  # noqa: E731
+    monkeypatch.setattr(membership, "Verification", verdict)
+    monkeypatch.setattr(station.datasheets, "datasheet", images.get)
+    monkeypatch.setattr(station.nodes, "all_shown_keys", lambda: [stub(uuid=uuid) for uuid in uuids])
+    found = [(uuids[5], hashlib.sha256(b"gone").hexdigest(), fingerprint(gone.point)[:16])]
+    assert membership.vouchable(station, None) == membership.vouchable(station, uuids) == found
+    assert membership.vouchable(station, uuids[:5]) == []
+    with pytest.raises(PolicyError) as error:
+        membership.vouch(station, found)
+    assert (error.value.message, error.value.hint) == (
+        "Only a keeper can vouch for datasheets.", "See: registry status"
+    )  # fmt: skip
+    monkeypatch.undo()
+    assert (membership.vouch(station, found), station.plant.unsent()) == (1, 1)
+
+
+# -- beside the service ------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_that_becomes_a_database_is_listened_to(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a station that left the registry meanwhile says nothing of its last sync."""
+    said = list[dict[str, str]]()
+    watch = service.PlantWatch(station, cast("Any", stub(event=lambda _of, **facts: said.append(facts))), lambda: None)
+    monkeypatch.setattr(type(station.plant), "joined", None)
+    watch._after(3)
+    assert said == []
+    done, turns = list[object](), iter([False, False, False, True, True])
+    stop: Any = stub(is_set=lambda: next(turns), wait=done.append)
+    listener = stub(listen=lambda: done.append("listen"), sweep=lambda: done.append("sweep"), close=lambda: None,
+                    wait=lambda seconds: done.append("wait") or True)  # fmt: skip
+    found = iter([None, listener])
+    monkeypatch.setattr(watch, "_stop", stop)
+    monkeypatch.setattr(connecting, "place_of", lambda _: "place")
+    monkeypatch.setattr(connecting, "listener", lambda _: next(found))
+    watch._listen()
+    assert done == [service.EVERY, "listen", "sweep", "wait"]
+    assert watch._wake.is_set()
