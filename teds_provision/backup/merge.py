@@ -328,9 +328,6 @@ class Merge:
             known = present.get(wanted.id)
             if known == wanted or (known is not None and not self.newer):
                 continue
-            if wanted.group is not None and self.live.groups.find(wanted.group) is None:
-                self.kept["measurements whose group is gone"] += 1
-                continue
             self.live.measurements.keep(wanted)
             self.back["measurements"] += 1
 

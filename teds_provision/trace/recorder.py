@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadDataError, NotFoundError, StoreError
+from teds_provision.errors import BadDataError, StoreError
 from teds_provision.files import PRIVATE, open_to_read, require_new
 from teds_provision.links.ports import Direction
 from teds_provision.trace import pcapng
@@ -30,8 +30,6 @@ def open_trace(path: Path, notify: Callable[[str], None]) -> Recorder:
     require_new(path)
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
-    except FileNotFoundError:
-        raise NotFoundError(f"There is no folder {path.parent}.") from None
     except OSError as error:
         raise StoreError(
             f"The trace {path} cannot be written: {error.strerror}.", hint="Choose another file for --trace."

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
+import io
 import json
 import shutil
 import subprocess
@@ -19,7 +21,7 @@ from teds_provision import __version__
 from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.restore import open_present
 from teds_provision.backup.sealed_file import SealedFile, Sealer
-from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, WrongPassphraseError
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey, verify
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
@@ -200,3 +202,19 @@ def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Statio
     finally:
         stop.set()
         writer.join()
+
+
+def test_a_disk_that_fails_while_a_backup_is_opened_is_named(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    back_up(station, tmp_path / "b")
+    sealed = SealedFile(tmp_path / "b")
+
+    class Failing(io.BytesIO):
+        def seek(self, _place: int, _whence: int = 0, /) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(backup_file, "open_to_read", lambda _path: Failing())
+    with pytest.raises(NotFoundError) as failed:
+        sealed.open_with_passphrase(SEALED)
+    assert failed.value.message == f"{tmp_path / 'b'} cannot be read: Input/output error."

@@ -99,6 +99,20 @@ def test_any_length_goes_through_the_chunks(length: int) -> None:
         ChunkReader(io.BytesIO(out.getvalue()), key, b"other").require_end()
 
 
+@pytest.mark.parametrize(("octets", "good"), [(100, True), (101, False)])
+def test_a_header_ends_within_its_bound(octets: int, good: bool) -> None:
+    key, out = os.urandom(32), io.BytesIO()
+    writer = ChunkWriter(out, key, b"context")
+    writer.write(b"x" * octets + b"\nrest")
+    writer.end()
+    reader = ChunkReader(io.BytesIO(out.getvalue()), key, b"context")
+    if good:
+        assert (reader.read_line(100), reader.read(4)) == (b"x" * octets, b"rest")
+    else:
+        with pytest.raises(BadDataError, match=r"^The content of the backup has no header\.$"):
+            reader.read_line(100)
+
+
 @pytest.mark.parametrize(
     "line", ['{"format":"teds-backup/1","store":"…"}', '{"protected":"e30","recipients":[],"ciphertext":"","tag":""}']
 )

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.backup.restore import open_present
-from teds_provision.errors import NotFoundError, StoreError
+from teds_provision.backup.restore import open_present, open_vault_of
+from teds_provision.errors import NewerStoreError, NotFoundError, StoreError, VaultChangedError, WrongPassphraseError
 from teds_provision.station.snapshot import place, set_aside
 from teds_provision.station.station import Station
 from teds_provision.station.store.store import Store
@@ -131,3 +131,63 @@ def test_a_log_left_by_a_lost_store_is_not_replayed_into_the_restored_one(statio
     restored_into(home, opened(path))
     with Store.open(home) as store:
         assert store.damage() is None
+
+
+def test_a_home_that_cannot_be_made_is_named(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(StoreError) as refused:
+        restored_into(tmp_path / "taken" / "home", opened(tmp_path / "b"))
+    assert refused.value.message == f"{tmp_path / 'taken' / 'home'} cannot be made: Not a directory."
+    assert refused.value.hint == "Choose another --home."
+
+
+def test_a_store_that_is_no_use_for_another_reason_than_damage_is_not_replaced(
+    station: Station, tmp_path: Path
+) -> None:
+    """One of a newer version holds more than the backup: it is neither moved away nor merged into."""
+    back_up(station, tmp_path / "b")
+    content = opened(tmp_path / "b")
+    station._store.execute("PRAGMA user_version = 999")
+    with pytest.raises(NewerStoreError):
+        open_present(station.home, content)
+    assert [path.name for path in station.home.iterdir() if "damaged" in path.name] == []
+
+
+def test_a_store_whose_rows_are_damaged_counts_as_lost(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    back_up(station, tmp_path / "b")
+    content = opened(tmp_path / "b")
+    present = open_present(station.home, content)
+    assert present is not None
+    present.close()
+    monkeypatch.setattr(Station, "damage", lambda _station: "row 7 is missing from an index")
+    assert open_present(station.home, content) is None
+
+
+def test_a_station_that_another_command_made_meanwhile_is_not_replaced(station: Station, tmp_path: Path) -> None:
+    """While a person typed the passphrase, another restore had come to its end."""
+    back_up(station, tmp_path / "b")
+    home = tmp_path / "new"
+    restored_into(home, opened(tmp_path / "b"))
+    with Station.inspect(home) as made:
+        before = b"".join(made.rows())
+    with pytest.raises(VaultChangedError) as refused:
+        restored_into(home, opened(tmp_path / "b"))
+    assert refused.value.message == (
+        f"Another command has created the station in {home} in the meantime; this one changed nothing."
+    )
+    assert refused.value.hint == "Run it again: it restores what is missing."
+    with Station.inspect(home) as made:
+        assert b"".join(made.rows()) == before
+
+
+def test_before_any_lock_a_lost_vault_is_no_error_and_a_wrong_passphrase_is(station: Station) -> None:
+    forget_vaults()
+    with pytest.raises(WrongPassphraseError):
+        open_vault_of(station, lambda _prompt, _confirm: "not that passphrase")
+    open_vault_of(station, ask)
+    (station.home / "vault.json").unlink()
+    forget_vaults()
+    open_vault_of(station, lambda _prompt, _confirm: pytest.fail("there is nothing to ask for"))

@@ -11,6 +11,7 @@ import pytest
 from teds_provision.backup.merge import Merge
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.event import hash_of_statement
+from teds_provision.station.plant.line import JobRow
 from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.snapshot import Relation
 from teds_provision.station.station import Station
@@ -323,6 +324,82 @@ def test_kept_measurements_come_from_a_copy_that_is_not_older(two: Two) -> None:
     assert two.merged(OTHER).back["measurements"] == 0
     assert two.merged(NEWER).back["measurements"] == 1
     assert two.live.measurements.lasting() == [changed]
+
+
+@pytest.mark.parametrize("how", [OTHER, NEWER])
+def test_names_and_frames_of_a_node_that_is_measured_stay_as_they_are(two: Two, how: Relation) -> None:
+    two.copy.measurements.rename(A, 0, "wrist")
+    two.copy.measurements.set_frame(A, 0, "tool0")
+    two.copy.measurements.set_frame(B, 1, "tool1")
+    two.live.measurements.set_frame(B, 1, "tool1")
+    with two.live.measurements.running([A]):
+        done = two.merged(how)
+        assert dict(done.back) == {}
+        assert dict(done.kept) == {"chosen names in use here": 1, "frames of measured nodes": 1}
+    done = two.merged(how)
+    assert (dict(done.back), dict(done.kept)) == ({"names": 1, "frames": 1}, {})
+    assert two.live.measurements.names == {(A, 0): "wrist"}
+    assert two.live.measurements.frames == {(A, 0): "tool0", (B, 1): "tool1"}
+
+
+def test_a_frame_that_both_have_is_that_of_a_newer_copy_alone(two: Two) -> None:
+    two.live.measurements.set_frame(A, 0, "here")
+    two.copy.measurements.set_frame(A, 0, "there")
+    for how, frame in ((OLDER, "here"), (OTHER, "here"), (NEWER, "there")):
+        two.merged(how)
+        assert two.live.measurements.frames == {(A, 0): frame}
+
+
+@pytest.mark.parametrize(
+    ("hash_", "how", "state"),
+    [
+        ("0", NEWER, "closed"),
+        ("0", OTHER, "open"),
+        ("0", OLDER, "open"),
+        ("1", NEWER, "open"),  # another job of the same name
+    ],
+)
+def test_a_job_is_closed_by_a_newer_copy_of_the_same_job_alone(two: Two, hash_: str, how: Relation, state: str) -> None:
+    two.live.plant.line.add_job(JobRow("job", "0" * 64, b"octets"))
+    two.copy.plant.line.add_job(JobRow("job", hash_ * 64, b"octets"))
+    two.copy.plant.line.set_job_state("job", "closed")
+    assert two.merged(how).back["jobs"] == 0
+    assert two.live.plant.line.state_of("job") == (state, False)
+
+
+def test_a_ban_that_comes_back_is_judged_again_by_the_plant(two: Two) -> None:
+    """Other stations may have lifted it since: the next fold of their pages decides."""
+    ban = RevocationRecord(A, None, "lost", "a.b.c", AT)
+    two.copy.policy.deny(ban)
+    two.merged(OLDER)
+    assert two.live.plant.claims.to_judge(9) == [], "this station has joined no plant"
+    two.copy.policy.deny(replace(ban, uuid=B, statement="d.e.f"))
+    two.live.plant.put_record(PlantRecord("6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"))
+    two.merged(OLDER)
+    assert two.live.plant.claims.to_judge(9) == [B]
+
+
+def test_facts_of_a_station_come_back_where_init_had_not_reached_them(two: Two) -> None:
+    """The keystore is that of this machine; facts that are here stay."""
+    facts = two.live.identity.record()
+    assert facts is not None
+    assert facts.point is not None
+    there = replace(facts, name="copy", keystore="keyring", keystore_why="as the backup had it")
+    two.copy.identity.put(there)
+    begun = replace(facts, point=None, ca=None, signature=None, keystore="file", keystore_why="as requested")
+    for here, after, back in (
+        (facts, facts, 0),
+        (begun, replace(there, keystore="file", keystore_why="as requested"), 1),
+        (None, there, 1),
+    ):
+        two.live._store.execute("DELETE FROM station")
+        if here is not None:
+            two.live.identity.put(here)
+        two.live.identity._seen = None
+        assert two.merged(OTHER).back["station"] == back
+        kept = two.live.identity.record()
+        assert kept is not None
+        assert replace(kept, mac=None) == replace(after, mac=None)
 
 
 def test_events_for_the_plant_that_wait_come_once_from_a_copy_that_is_not_older(two: Two) -> None:

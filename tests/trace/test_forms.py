@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, UsageError
 from teds_provision.links.ports import Direction
-from teds_provision.trace import pcapng
+from teds_provision.trace import pcapng, recorder
 from teds_provision.trace import record as lines
 from teds_provision.trace.frames import can_words, nfc_words
 from teds_provision.trace.record import Record
@@ -451,3 +451,49 @@ def test_each_frame_is_named_by_its_link(
     trace.close()
     assert (record.link, record.layer, record.direction, record.octets.hex()) == (link, "frame", "out", octets)
     assert (record.command, record.identifier, record.fd) == (words, identifier, identifier is not None)
+
+
+@pytest.mark.parametrize(
+    ("options", "direction"),
+    [
+        (option(2, le(2)), "out"),
+        (option(2, le(1)), "in"),
+        (option(2, le(0)), "in"),  # not said
+        (option(2, le(0xFFFF_FFFE)), "out"),  # its other bits say other things
+        (option(2, b"\2\0"), "in"),  # damaged
+        (option(1, b"name") + option(4, le(2)), "in"),  # four octets of another option
+    ],
+)
+def test_the_direction_of_a_packet_is_in_two_bits_of_its_flags(options: bytes, direction: str) -> None:
+    """Link-layer flags of pcapng: 01 inbound, 10 outbound."""
+    octets = packet(0, 0, b"\x98\xda\x21\xf1\1\0\0\0\1", options + END)
+    (record,) = pcapng.read_pcapng(pcapng.head() + octets)
+    assert record.direction == direction
+
+
+def test_a_trace_that_cannot_be_made_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is a file or a link written over that someone else makes meanwhile."""
+    with pytest.raises(NotFoundError) as missing:
+        open_trace(tmp_path / "nowhere" / "t", pytest.fail)
+    assert missing.value.message == f"There is no folder {tmp_path / 'nowhere'}."
+    monkeypatch.setattr(recorder, "require_new", lambda _path: (tmp_path / "t").symlink_to("elsewhere"))
+    with pytest.raises(StoreError) as failed:
+        open_trace(tmp_path / "t", pytest.fail)
+    assert failed.value.message == f"The trace {tmp_path / 't'} cannot be written: File exists."
+    assert failed.value.hint == "Choose another file for --trace."
+
+
+@pytest.mark.parametrize("beyond", [0, 1])
+def test_a_trace_beyond_its_bound_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, beyond: int) -> None:
+    written = lines.head() + lines.line(Record(0.0, "in", "can", "frame", b"\1", identifier=1))
+    (tmp_path / "t").write_bytes(written)
+    bound = len(written) - beyond
+    monkeypatch.setattr(recorder, "_MOST_OCTETS", bound)
+    if beyond:
+        with pytest.raises(BadDataError) as refused:
+            read_trace(tmp_path / "t")
+        assert refused.value.message == (
+            f"{tmp_path / 't'} is larger than {bound} octets, which is too large for a trace."
+        )
+    else:
+        assert len(list(read_trace(tmp_path / "t"))) == 1
