@@ -136,8 +136,8 @@ def test_a_log_left_by_a_lost_store_is_not_replayed_into_the_restored_one(statio
 def test_a_home_that_cannot_be_made_is_named(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(StoreError) as refused:
-        restored_into(tmp_path / "taken" / "home", opened(tmp_path / "b"))
+    with opened(tmp_path / "b") as content, pytest.raises(StoreError) as refused:
+        restored_into(tmp_path / "taken" / "home", content)
     assert refused.value.message == f"{tmp_path / 'taken' / 'home'} cannot be made: Not a directory."
     assert refused.value.hint == "Choose another --home."
 
@@ -146,24 +146,22 @@ def test_a_store_that_is_no_use_for_another_reason_than_damage_is_not_replaced(
     station: Station, tmp_path: Path
 ) -> None:
     """One of a newer version holds more than the backup: it is neither moved away nor merged into."""
-    back_up(station, tmp_path / "b")
-    content = opened(tmp_path / "b")
-    station._store.execute("PRAGMA user_version = 999")
-    with pytest.raises(NewerStoreError):
-        open_present(station.home, content)
+    with copy_of(station, tmp_path) as content:
+        station._store.execute("PRAGMA user_version = 999")
+        with pytest.raises(NewerStoreError):
+            open_present(station.home, content)
     assert [path.name for path in station.home.iterdir() if "damaged" in path.name] == []
 
 
 def test_a_store_whose_rows_are_damaged_counts_as_lost(
     station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    back_up(station, tmp_path / "b")
-    content = opened(tmp_path / "b")
-    present = open_present(station.home, content)
-    assert present is not None
-    present.close()
-    monkeypatch.setattr(Station, "damage", lambda _station: "row 7 is missing from an index")
-    assert open_present(station.home, content) is None
+    with copy_of(station, tmp_path) as content:
+        present = open_present(station.home, content)
+        assert present is not None
+        present.close()
+        monkeypatch.setattr(Station, "damage", lambda _station: "row 7 is missing from an index")
+        assert open_present(station.home, content) is None
 
 
 def test_a_station_that_another_command_made_meanwhile_is_not_replaced(station: Station, tmp_path: Path) -> None:
@@ -173,8 +171,8 @@ def test_a_station_that_another_command_made_meanwhile_is_not_replaced(station: 
     restored_into(home, opened(tmp_path / "b"))
     with Station.inspect(home) as made:
         before = b"".join(made.rows())
-    with pytest.raises(VaultChangedError) as refused:
-        restored_into(home, opened(tmp_path / "b"))
+    with opened(tmp_path / "b") as content, pytest.raises(VaultChangedError) as refused:
+        restored_into(home, content)
     assert refused.value.message == (
         f"Another command has created the station in {home} in the meantime; this one changed nothing."
     )
