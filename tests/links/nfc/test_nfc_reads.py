@@ -5,12 +5,20 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import nfc.clf
 import nfc.tag
 import pytest
 
 from teds_provision.errors import GarbledError
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
-from teds_provision.links.nfc.tag import NfcpyType4Ndef, ReaderTag, Type4Ndef, _frame_limits
+from teds_provision.links.nfc.tag import (
+    NfcpyType4Ndef,
+    ReaderTag,
+    Type4Ndef,
+    _BufferedFrontend,
+    _frame_limits,
+    _Type4Tag,
+)
 from teds_provision.node.nfc.tags import NdefApplication, Type4Memory
 
 
@@ -147,3 +155,74 @@ def test_a_file_is_selected_again_after_one_that_is_not_there(monkeypatch: pytes
 def test_an_answer_to_select_may_leave_any_part_out(ats: str, limits: tuple[int, int]) -> None:
     """ISO/IEC 14443-4, 5.2: a format octet, which names those of TA(1), TB(1) and TC(1) that follow."""
     assert _frame_limits(bytes.fromhex(ats)) == limits
+
+
+class Air:
+    """A front end that takes frames of so many octets; the tag answers with ``ats``, and then always ``answer``."""
+
+    def __init__(self, ats: str, sends: int = 256, receives: int = 256) -> None:
+        self.ats, self.max_send_data_size, self.max_recv_data_size = bytes.fromhex(ats), sends, receives
+        self.sent: list[tuple[bytes, float]] = []
+        self.answer: bytes | None = b"\xa3"
+
+    def exchange(self, octets: bytes, timeout: float) -> bytes:
+        self.sent.append((bytes(octets), timeout))
+        if octets[0] == 0xE0:
+            return self.ats
+        if self.answer is None:
+            raise nfc.clf.TimeoutError
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("ats", "sends", "receives", "asked", "frame", "periods"),
+    [
+        ("0578 80 b0 00", 256, 256, "e080", 256, 1 << 11),
+        ("0578 80 b0 00", 256, 255, "e070", 256, 1 << 11),
+        ("0578 80 b0 00", 64, 256, "e080", 64, 1 << 11),
+        ("057f 80 b0 00", 300, 300, "e080", 256, 1 << 11),  # FSCI 9 to 15 are reserved: as 8
+        ("0575 80 f0 00", 256, 256, "e080", 64, 1 << 4),  # FWI 15 is reserved: as 4
+        ("0575 80 e0 00", 256, 256, "e080", 64, 1 << 14),
+        ("01", 256, 256, "e080", 32, 1 << 4),
+        ("0270", 256, 256, "e080", 16, 1 << 4),
+    ],
+)
+def test_frames_and_waits_are_those_of_the_tag_and_of_the_reader(
+    ats: str, sends: int, receives: int, asked: str, frame: int, periods: int
+) -> None:
+    """ISO/IEC 14443-4, 5.1 and 5.2.5: FSDI 8 is 256 octets, 7 is 128; the frame waiting time is 302 µs · 2^FWI."""
+    air = Air(ats, sends, receives)
+    tag = _Type4Tag(air, SimpleNamespace(sdd_res=bytearray(7)))
+    assert air.sent[0][0].hex() == asked
+    assert tag._dep.miu == frame - 3
+    assert tag._dep.fwt == pytest.approx(302.06e-6 * periods, rel=1e-4)
+
+
+def test_a_type_4_tag_is_there_as_long_as_it_answers_at_all() -> None:
+    """An R(NAK) asks for no work, and whatever comes is the tag's."""
+    air = Air("0578 80 b0 00")
+    tag = _Type4Tag(air, SimpleNamespace(sdd_res=bytearray(7)))
+    assert tag.is_present is True
+    octets, wait = air.sent[-1]
+    assert (octets.hex(), wait) == ("b2", 0.06)
+    tag._dep.pni = 1
+    air.answer = None
+    assert tag.is_present is False
+    assert air.sent[-1][0].hex() == "b3"
+
+
+def test_a_command_has_so_long_as_the_whole_of_its_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("teds_provision.links.nfc.tag.time.monotonic", lambda: now[0])
+    air = Air("")
+    front = _BufferedFrontend(air)
+    front.until = 105.0
+    front.exchange(b"\x02", 9.0)
+    now[0] = 104.5
+    front.exchange(b"\x02", 9.0)
+    front.exchange(b"\x02", 0.1)
+    assert [wait for _, wait in air.sent] == [5.0, 0.5, 0.1]
+    now[0] = 105.0
+    with pytest.raises(Type4TagCommandError):
+        front.exchange(b"\x02", 9.0)
+    assert len(air.sent) == 3
