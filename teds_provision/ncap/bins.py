@@ -251,6 +251,8 @@ class FewBins(SegmentedBins):
         """Empty the bins from ``first`` to ``last``."""
         if self._numbers and self._numbers[-1] >= first:
             self._drop(bisect_left(self._numbers, first), bisect_right(self._numbers, last))
+            # those that are too old but not removed yet would be back in reach after the clock was set back
+            self._drop(0, bisect_right(self._numbers, self.newest - self.size))
 
     def _drop(self, begin: int, end: int) -> None:
         for column in (self._numbers, self._low, self._high, self._samples, self._invalid):

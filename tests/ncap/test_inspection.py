@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -141,3 +142,38 @@ def test_a_strangers_teds_of_more_than_65535_octets_is_refused(monkeypatch: pyte
     assert len(shown[1, 3]) == 65_535
     with pytest.raises(BadDataError, match="TEDS 3 of channel 1 has 65536 octets: too long"):
         strangers_reading(monkeypatch, [(1, 3)], 65_536)
+
+
+@pytest.mark.parametrize("verdict", ["authentic", "unsigned", "not authentic"])
+def test_of_a_node_in_a_session_the_datasheet_is_shown_apart_only_if_it_is_not_authentic(
+    verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = SimpleNamespace(verified=SimpleNamespace(verdict=verdict), judged="judged", image="image")
+    none: Any = None
+    monkeypatch.setattr(inspection, "session_if_keyed", lambda *_: None)
+    assert inspection._in_session(none, none) is None
+    assert inspection.read_anew(none, none) is None, "without a session nothing is read"
+    monkeypatch.setattr(inspection, "session_if_keyed", lambda *_: object())
+    monkeypatch.setattr(
+        inspection, "verify_in_session", lambda _station, _node, *, by: looked if by == "ncap" else None
+    )
+    monkeypatch.setattr(inspection, "power_of", lambda _node: {"level": 80})
+    monkeypatch.setattr(inspection.Sheet, "from_image", lambda image: f"sheet of {image}")
+    found = inspection._in_session(none, none)
+    assert found is not None
+    shown = "sheet of image" if verdict == "not authentic" else None
+    assert (found.judged, found.sheet, found.power) == ("judged", shown, {"level": 80})
+
+
+def test_a_node_is_read_anew_in_its_session_and_that_reading_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[Any] = []
+    node: Any = SimpleNamespace(uuid=bytes(10), open_counter=b"c")
+    station: Any = SimpleNamespace(durable=lambda what: nullcontext(course.append(what)))
+    monkeypatch.setattr(inspection, "session_if_keyed", lambda *_: object())
+    monkeypatch.setattr(inspection, "read_identity", lambda _node: "identity")
+    monkeypatch.setattr(inspection, "read_image", lambda _node: "image")
+    monkeypatch.setattr(inspection, "freshness_floor_of", lambda *given: given[1:])
+    monkeypatch.setattr(inspection, "keep", lambda *given, **how: (given[2], how))
+    image, kept = inspection.read_anew(station, node) or (None, None)
+    assert (image, course) == ("image", ["read"])
+    assert kept == ("image", {"by": "ncap", "floor": (bytes(10), "identity"), "c": b"c"})

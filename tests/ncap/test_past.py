@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import Block, ChannelFacts
+from teds_provision.ncap import history
 from teds_provision.ncap.bins import Bins, FewBins
 from teds_provision.ncap.history import HOUR, History
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
@@ -196,6 +197,7 @@ _VALUES = st.one_of(st.floats(-1e6, 1e6, width=32), st.just(math.nan), st.sample
         max_size=120,
     )
 )
+@example([(-5, math.nan, True, 0, 0), (60, math.nan, False, 0, 0), (-9, 1.0, True, 0, 0)])
 def test_bins_hold_what_a_list_of_all_samples_holds(
     make: Callable[[], Bins | FewBins], samples: list[tuple[int, float, bool, int, int]]
 ) -> None:
@@ -515,3 +517,40 @@ def test_the_rate_is_that_of_the_last_ten_seconds_and_a_value_keeps_seven_digits
     assert (history["rate"], history["low"][-1]) == (5.0, 1.234567)
     recent = past.channel_history(NODE, 1, NOW - 30, NOW + 40, points=3600)
     assert recent["bin"] == 1.0, "more than a minute was asked for"
+
+
+def test_of_few_bins_those_of_a_time_are_emptied_and_a_value_that_is_none_bounds_nothing() -> None:
+    few, nan = FewBins(1.0, 60), float("nan")
+    for number, values in ((3, (nan, 2.0, nan, 1.0, 1.5)), (5, (4.0, nan)), (7, (nan, nan)), (9, (6.0, 8.0))):
+        for value in values:
+            few.add_one(number, value, 0, 0, 0)
+
+    def held() -> list[tuple[int, float, float, int]]:
+        numbers, low, high, counts = few.between(0, 9)
+        return list(zip(numbers.tolist(), low.tolist(), high.tolist(), counts[0].tolist(), strict=True))
+
+    def same(found: list[tuple[int, float, float, int]], wanted: list[tuple[int, float, float, int]]) -> bool:
+        return repr(found) == repr(wanted)
+
+    every = [(3, 1.0, 2.0, 5), (5, 4.0, 4.0, 2), (7, nan, nan, 2), (9, 6.0, 8.0, 2)]
+    assert same(held(), every)
+    few._forget(10, 12)
+    assert same(held(), every), "there is nothing of that time"
+    few._forget(4, 7)
+    assert same(held(), [every[0], every[3]])
+    few._forget(9, 9)
+    assert same(held(), [every[0]])
+
+
+def test_what_a_segment_means_is_known_as_long_as_the_minute_or_the_hour_has_samples_of_it() -> None:
+    meanings: Any = ["rad", "degree", "m"]
+    channel = history._Channel(meanings[0])
+    channel.add_one(NOW, 1.0, 0, 0)
+    channel.begin_segment(meanings[1])
+    channel.minute.add_one(round(NOW / history.FINE) + 5, 1.0, 0, 0, 1)
+    channel.hour = Bins(1.0, 10, coarse=False)
+    channel.begin_segment(meanings[2])
+    assert channel._meanings == {0: "rad", 1: "degree", 2: "m"}, "of the minute alone"
+    channel.minute = FewBins(history.FINE, 10)
+    channel.begin_segment(meanings[0])
+    assert channel._meanings == {3: "rad"}

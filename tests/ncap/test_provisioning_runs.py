@@ -14,18 +14,21 @@ import pytest
 from teds_provision.errors import (
     BadDataError,
     NodeRefusedError,
+    NodeSilentError,
     NotAuthenticError,
     NotFoundError,
     PolicyError,
     StoreError,
     UsageError,
 )
+from teds_provision.links import Notice
 from teds_provision.ncap.nodes import provisioning
 from teds_provision.ncap.nodes.node_jobs import NodeJobs
 from teds_provision.ncap.nodes.provisioning import NEXT, AutoProvisioner, Provisioning, ProvisioningRun
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.station.store.audit import ACTOR, acting_for
 from tests.pace import until
 
@@ -470,3 +473,48 @@ def test_a_node_that_is_tapped_at_the_very_end_of_its_time_is_provisioned(
             "message": f"Node {NODE} was not placed on a reader within 300 s.",
             "hint": "Try again, and hold its NFC antenna flat on the reader.",
         }
+
+
+def test_a_run_that_nobody_requested_cannot_be_cancelled(desk: Desk) -> None:
+    with pytest.raises(NotFoundError, match=f"No provisioning was requested for node {NODE}"):
+        desk.runs.cancel(NODE)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (PolicyError("It is another owner's.", hint="Ask it."), "refused", "It is another owner's."),
+        (SessionLostError(NodeSilentError("It is silent.")), "node-silent", "It is silent."),
+        (RuntimeError("a bug"), "bug", "Unexpected RuntimeError."),
+    ],
+)
+def test_a_run_on_a_bus_that_ends_in_whatever_way_says_why_and_leaves_no_file(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, error: Exception, code: str, message: str
+) -> None:
+    def provision(*_: Any, **__: Any) -> Any:
+        raise error
+
+    @contextmanager
+    def apart(_uuid: str, _why: str) -> Iterator[None]:
+        yield
+
+    def with_node(uuid: str, _what: str, work: Any) -> None:
+        work(SimpleNamespace(uuid=bytes.fromhex(uuid)))
+
+    monkeypatch.setattr(provisioning, "provision", provision)
+    monkeypatch.setattr(desk.runs, "_apart", apart)
+    monkeypatch.setattr(desk.jobs, "on_a_bus", lambda _uuid: True)
+    monkeypatch.setattr(desk.jobs, "with_node", with_node)
+    desk.runs.begin(NODE, **ORDER)
+    until(lambda: desk.state(NODE) == "failed")
+    until(lambda: not desk.files[0].exists())
+    found = desk.runs.run_of(NODE)["error"]
+    assert (found["code"], found["message"]) == (code, message)
+
+
+def test_what_a_run_waits_for_is_an_event(desk: Desk) -> None:
+    events: list[dict[str, Any]] = []
+    live: Any = SimpleNamespace(event=lambda kind, **facts: events.append({"event": kind, **facts}))
+    run: Any = SimpleNamespace(uuid=NODE, steps=[])
+    provisioning._RunReporter(run, live).notice(Notice("retry", "It is busy."))
+    assert events == [{"event": "provision", "uuid": NODE, "state": "running", "text": "It is busy."}]

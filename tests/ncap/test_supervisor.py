@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -741,3 +742,320 @@ def test_an_expression_that_selects_only_nodes_with_a_key_and_a_datasheet_in_ser
     monkeypatch.setattr(service.station.datasheets, "datasheet", lambda uuid: None if uuid == uuids[3] else object())
     monkeypatch.setattr(NodeMatch, "why_not", lambda _self, _station, uuid: "named x" if uuid == uuids[4] else "")
     assert service.measurements._selected("all") == ([uuids[0], uuids[5]], "")
+
+
+def joining(service: Service, monkeypatch: pytest.MonkeyPatch) -> tuple[RunningMeasurement, list[Any]]:
+    """Return a measurement with an arrived node that holds its lock, and the sightings that are asked about."""
+    running, asked = open_to(service, monkeypatch), list[Any]()
+    service.locks.acquire(NODE, "measurement 1", frozen=True)
+    running.membership.members[NODE] = Member(joined=False, locked=True)
+    running.reports[NODE] = {"uuid": NODE, "state": "lost", "why": ""}
+    monkeypatch.setattr(service.measurements._workers, "submit", lambda _ask, sighting: asked.append(sighting))
+    return running, asked
+
+
+@pytest.mark.parametrize(
+    ("unselected", "seen", "place", "past", "asked"),
+    [
+        ("renamed", True, True, {NODE}, []),
+        ("renamed", False, True, {NODE}, ["place"]),
+        ("", False, True, set(), ["place"]),
+        ("", False, False, set(), []),
+    ],
+)
+def test_a_node_that_went_or_is_not_meant_any_more_as_it_joins_is_given_back(
+    service: Service,
+    monkeypatch: pytest.MonkeyPatch,
+    unselected: str,
+    seen: bool,
+    place: bool,
+    past: set[str],
+    asked: list[str],
+) -> None:
+    """One that is only away is asked at the place where its session failed, and joins if it answers."""
+    running, questions = joining(service, monkeypatch)
+    monkeypatch.setattr(service.measurements, "_why_not", lambda *_: unselected)
+    if not seen:
+        monkeypatch.setattr(service.buses.presence, "seen_at", lambda _uuid: None)
+    if place:
+        running.membership.places[NODE] = cast(Any, "place")
+    service.measurements._join(running, cast(Any, None), NODE)
+    assert (running.past, questions) == (past, asked)
+    assert (running.membership.members, service.locks.holder(NODE)) == ({}, None)
+
+
+def test_a_node_that_is_being_renamed_or_was_lent_as_it_joins_waits_or_goes_to_the_writer(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, _ = joining(service, monkeypatch)
+    monkeypatch.setattr(measurement_supervisor, "time", SimpleNamespace(monotonic=lambda: 100.0, time=lambda: 0.0))
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise PolicyError("The node is being renamed.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(service.station.measurements, "running", refuse)
+        service.measurements._join(running, cast(Any, None), NODE)
+    waits = running.membership.waits[NODE]
+    assert (waits.at, waits.room, service.locks.holder(NODE)) == (101.0, None, None), "a second later it is tried again"
+    assert running.reports[NODE] == {"uuid": NODE, "state": "waiting", "why": "The node is being renamed."}
+
+    service.locks.acquire(NODE, "measurement 1", frozen=True)
+    running.membership.members[NODE] = Member(joined=False, locked=True)
+    service.measurements._loans[NODE] = [NodeLoan(NODE, "let go for write")]
+    service.measurements._join(running, cast(Any, None), NODE)
+    assert (running.membership.elsewhere, running.membership.members) == ({NODE}, {})
+    assert service.locks.holder(NODE) is None
+    service.measurements._loans.clear()
+
+
+def test_a_waiting_node_that_has_gone_is_shown_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    running = open_to(service, monkeypatch)
+    considered: list[str] = []
+    monkeypatch.setattr(service.measurements, "_consider", lambda _running, uuid: considered.append(uuid))
+    for node in (NODE, OTHER):
+        running.membership.waits[node] = cast(Any, SimpleNamespace(at=0.0, room=None))
+    service.directory.note(OTHER, present=True)
+    service.measurements._try_again(running, 1.0)
+    assert (considered, running.past) == ([OTHER], {NODE})
+
+
+@pytest.mark.parametrize(
+    ("error", "phase", "state"),
+    [
+        (StoreError("The disk is away."), Phase.MEASURING, "waiting"),
+        (StoreError("The disk is away."), Phase.LOCKING, "failed"),
+        (UsageError("It cannot be."), Phase.MEASURING, "failed"),
+    ],
+)
+def test_only_a_store_that_fails_while_values_come_is_waited_for(
+    service: Service, monkeypatch: pytest.MonkeyPatch, error: Exception, phase: Phase, state: str
+) -> None:
+    """Whatever else fails ends that measurement, and its reason stays to be seen."""
+    running, looked = listed(service, NODE), threading.Event()
+    running.phase, running.state = phase, "waiting"
+    running.over.clear()
+
+    def look(_running: RunningMeasurement, _now: float) -> None:
+        looked.set()
+        raise error
+
+    monkeypatch.setattr(service.measurements, "_look_at", look)
+    thread = threading.Thread(target=service.measurements._decide, daemon=True)
+    thread.start()
+    service.measurements._wake.set()
+    assert looked.wait(10)
+    until(lambda: running.not_before > 0 if state == "waiting" else running.phase is Phase.ENDING)
+    assert (running.failed, service.state("1")[1]) == (("", "") if state == "waiting" else (str(error),) * 2)
+    assert (running.not_before > 0, service.state("1")[0]) == (state == "waiting", state)
+    running.phase = Phase.OVER
+    running.over.set()
+
+
+def test_a_measurement_that_fails_at_its_end_stays_to_be_seen(service: Service) -> None:
+    running = listed(service, NODE)
+    running.phase = Phase.ENDING
+    running.over.clear()
+    service.measurements._fail(running, UsageError("It cannot be."))
+    assert (running.phase, running.over.is_set(), service.state("1")) == (Phase.OVER, True, ("failed", "It cannot be."))
+
+
+@pytest.mark.parametrize(
+    ("job", "failed", "stopped", "match", "state", "shown", "logged"),
+    [
+        (True, "", False, None, "ended", False, ["ended"]),
+        (True, "", True, None, "ended", True, []),
+        (True, "", False, "all", "ended", True, []),
+        (True, "It failed.", False, None, "failed", True, []),
+        (False, "", False, None, "failed", True, []),
+    ],
+)
+def test_what_ends_by_itself_is_logged_and_gone_and_all_else_stays_until_it_is_deleted(
+    service: Service,
+    job: bool,
+    failed: str,
+    stopped: bool,
+    match: str | None,
+    state: str,
+    shown: bool,
+    logged: list[str],
+) -> None:
+    running, events = listed(service, NODE), list[str]()
+    service.live.on_event = lambda event: events.append(event["state"]) if event["event"] == "measurement" else None
+    running.asked = replace(running.asked, match=match)
+    running.job = cast(Any, SimpleNamespace(sinks=(), measurement=None)) if job else None
+    running.failed, running.state = failed, "failed"
+    if stopped:
+        running.stop.set()
+    running.over.clear()
+    service.measurements._finish(running)
+    assert (running.state, "1" in service.measurements._running, running.over.is_set()) == (state, shown, True)
+    assert [entry.outcome for entry in entries(service, "measure")] == logged
+    assert events == [*([] if state == "failed" else ["ended"]), *([] if shown else ["deleted"])]
+
+
+def test_what_commands_measure_is_shown_with_their_process_and_a_group_that_is_gone_is_not(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_commands = [
+        KeptMeasurement("8", group="nobody", owner="command", pid=3, started=1.0),
+        KeptMeasurement("9", uuids=(bytes.fromhex(NODE),), owner="command", pid=4711, started=2.0),
+    ]
+    monkeypatch.setattr(service.station.measurements, "of_commands", lambda: of_commands)
+    listed(service, OTHER)
+    assert [(shown["id"], shown["state"], shown["why"], shown["uuids"]) for shown in service.measurements.all()] == [
+        ("1", "starting", "", [OTHER]),
+        ("9", "running", "measured by the command measure (process 4711)", [NODE]),
+    ]
+
+
+def test_a_measurement_that_is_being_deleted_is_none_for_a_second_delete(service: Service) -> None:
+    running = listed(service, NODE)
+    running.deleted = True
+    with pytest.raises(NotFoundError, match="No measurement has the ID '1'"):
+        service.measurements.delete("1")
+    assert not running.stop.is_set()
+    assert (service.measurements.all(), service.measurements.measurement_of(NODE)) == ([], None)
+
+
+@pytest.mark.parametrize(
+    ("channels", "set_points", "kind", "asked"),
+    [
+        (None, True, None, []),
+        ([True, True], True, None, []),
+        ([True, True], False, None, [10.0, 10.0]),
+        ([True, False], True, None, [10.0, 10.0]),
+        ([], True, None, []),
+        ([False], True, "event", [10.0]),
+    ],
+)
+def test_a_plan_is_required_of_every_channel_unless_a_node_has_actuators_alone(
+    service: Service,
+    monkeypatch: pytest.MonkeyPatch,
+    channels: list[bool] | None,
+    set_points: bool,
+    kind: str | None,
+    asked: list[float],
+) -> None:
+    given: list[Any] = []
+    found = [] if channels is None else [SimpleNamespace(actuator=actuator) for actuator in channels]
+    module = measurement_supervisor
+    monkeypatch.setattr(module, "require_measurable", lambda _station, uuid: given.append(uuid.hex()))
+    monkeypatch.setattr(service.station.datasheets, "datasheet", lambda _uuid: None if channels is None else object())
+    monkeypatch.setattr(module.Sheet, "from_image", lambda _image: SimpleNamespace(channels=found))
+    monkeypatch.setattr(service.measurements._sinks, "allows_set_points", lambda _kept: set_points)
+    kinds: list[Any] = []
+    monkeypatch.setattr(module, "sensors_of", lambda of, _chosen, kind: (kinds.append(kind), of)[1])
+    monkeypatch.setattr(module, "period_of", lambda _channel, rate: given.append(rate))
+    kept = KeptMeasurement("", uuids=(bytes.fromhex(NODE),), rate=10.0, kind=kind)
+    service.measurements._require_plan(bytes.fromhex(NODE), kept)
+    assert given == [NODE, *asked]
+    assert kinds == ([None if kind is None else module.StreamKind[kind.upper()]] if asked or channels == [] else [])
+
+
+def test_a_frozen_selection_waits_with_its_reason_and_takes_the_nodes_that_no_other_has(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = listed(service, NODE)
+    running.asked = running.kept = replace(running.kept, uuids=(), match="name:x*", frozen=True, actuators=True)
+    running.phase, running.reports = Phase.SELECTING, {NODE: {"uuid": NODE, "state": "lost"}}
+    started: list[tuple[bytes, ...]] = []
+    monkeypatch.setattr(service.measurements, "_lock_members", lambda one, _now: started.append(one.kept.uuids))
+
+    def select(found: list[bytes], why: str) -> None:
+        done: Future[tuple[list[bytes], str]] = Future()
+        running.selection = done
+        service.measurements._select(running, 5.0)
+        assert (running.selection, started) == (done, []), "it is not ready"
+        done.set_result((found, why))
+        service.measurements._select(running, 7.0)
+        assert running.selection is None
+
+    for why, shown in (("", "no known node matches"), ("no type is named x", "no type is named x")):
+        select([], why)
+        assert (running.state, running.why, running.looked) == ("waiting", shown, 7.0)
+        assert (running.membership.members, running.reports) == ({}, {})
+    other = RunningMeasurement(
+        KeptMeasurement("2"), Membership(0.0, {OTHER: Member()}), KeptMeasurement("2"), phase=Phase.OVER
+    )
+    other.over.set()
+    service.measurements._running["2"] = other
+    select([bytes.fromhex(OTHER), bytes.fromhex(NODE)], "")
+    assert started == [(bytes.fromhex(NODE),)]
+    assert (running.kept.match, running.kept.actuators, running.uuids) == (None, False, (NODE,))
+    assert running.asked.match == "name:x*", "as it was asked, for when it begins again"
+
+
+@pytest.mark.parametrize(
+    ("error", "waited", "shown"),
+    [
+        (NodeBusyError("It is inspected."), 1.0, False),
+        (NodeBusyError("It is inspected."), 1e6, True),
+        (FrozenError("It is frozen."), 0.0, True),
+    ],
+)
+def test_a_node_that_something_else_works_on_is_waited_for_and_shown_after_a_while(
+    service: Service, monkeypatch: pytest.MonkeyPatch, error: PolicyError, waited: float, shown: bool
+) -> None:
+    running, course = listed(service, NODE, OTHER), list[str]()
+    monkeypatch.setattr(service.measurements, "_start", lambda *_: course.append("start"))
+
+    def acquire(uuid: str, what: str, *, wait: float, frozen: bool) -> None:
+        assert (what, wait, frozen) == ("measurement 1", 0.0, True)
+        if uuid == OTHER and error is not None:
+            raise error
+        course.append(uuid)
+
+    monkeypatch.setattr(service.locks, "acquire", acquire)
+    running.membership.members[NODE].locked = running.membership.members[OTHER].locked = False
+    running.looked = 100.0 - waited
+    service.measurements._lock_members(running, 100.0)
+    assert (course, running.looked) == ([NODE], 100.0), "the wait counts from the last lock"
+    assert service.directory.seen(NODE).measurement == "1"
+    running.looked = 100.0 - waited
+    service.measurements._lock_members(running, 100.0)
+    assert (running.state, running.why) == (("waiting", error.message) if shown else ("starting", ""))
+    monkeypatch.setattr(service.locks, "acquire", lambda *_, **__: None)
+    service.measurements._lock_members(running, 100.0)
+    assert course == [NODE, "start"]
+
+
+@pytest.mark.parametrize(
+    ("frozen", "retired", "kept", "ends", "stopped", "other"),
+    [
+        (True, False, None, None, False, False),
+        (True, True, None, None, False, True),
+        (False, True, "same", None, False, False),
+        (False, False, "same", None, False, False),
+        (False, False, "more", None, False, True),
+        (False, False, "gone group", None, False, True),
+        (False, False, None, None, False, True),
+        (False, False, None, 5.0, False, False),
+        (False, False, None, None, True, False),
+    ],
+)
+def test_a_measurement_begins_again_if_the_store_lists_other_nodes(
+    service: Service,
+    monkeypatch: pytest.MonkeyPatch,
+    frozen: bool,
+    retired: bool,
+    kept: str | None,
+    ends: float | None,
+    stopped: bool,
+    other: bool,
+) -> None:
+    running = listed(service, NODE)
+    running.kept = replace(running.kept, frozen=frozen)
+    if stopped:
+        running.stop.set()
+    node, more = bytes.fromhex(NODE), bytes.fromhex(OTHER)
+    now = {
+        "same": KeptMeasurement("1", uuids=(node,)),
+        "more": KeptMeasurement("1", uuids=(node, more)),
+        "gone group": KeptMeasurement("1", group="nobody"),
+        None: KeptMeasurement("2"),
+    }[kept]
+    monkeypatch.setattr(service.station.measurements, "all", lambda: [now])
+    monkeypatch.setattr(service.measurements, "_is_retired", lambda _uuid: retired)
+    job: Any = SimpleNamespace(kept=SimpleNamespace(ends=ends))
+    assert service.measurements._has_other_members(running, job) is other

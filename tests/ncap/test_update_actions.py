@@ -661,3 +661,26 @@ def test_an_update_lasts_until_its_end_or_until_now(
         "seconds": 1.235, "interrupts": [], "question": "", "step": None, "written": 0, "result": "updated",
         "error": None,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("where", ["in the session of a measurement", "on the bus"])
+def test_a_plan_that_loses_its_session_ends_with_the_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    cause, made = NoNodeError("It is silent."), updates_of(tmp_path)
+
+    def lose(*_: Any, **__: Any) -> Any:
+        raise SessionLostError(cause)
+
+    measured = where != "on the bus"
+    trusted = SimpleNamespace(node=SimpleNamespace(sealed=True)) if measured else None
+    words: Any = made
+    words._station = SimpleNamespace(policy=SimpleNamespace(require_whitelisted=lambda _uuid: None))
+    words._measured, words._bus_of = lambda _uuid: nullcontext(trusted), lambda _uuid: object()
+    words._require_unheld, words._slot = lambda _uuid: None, lambda _port: nullcontext()
+    words._node_locks = SimpleNamespace(hold=lambda _uuid, _what: nullcontext())
+    monkeypatch.setattr(updates, "plan_in", lose if measured else None)
+    monkeypatch.setattr(updates, "plan_at", None if measured else lose)
+    with pytest.raises(NoNodeError) as lost:
+        made._planned(NODE, cast(Any, None))
+    assert lost.value is cause

@@ -49,7 +49,7 @@ from teds_provision.provisioning.conversation import Conversation, SessionLostEr
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.image_manager import BoardImage, ImageManager
 from teds_provision.provisioning.parallel import ParallelWork
-from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.progress import SilentReporter, StepResult
 from teds_provision.provisioning.update import UpdateOrder, plan_update, update_at
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
@@ -1455,6 +1455,9 @@ def test_the_plan_of_an_update_that_is_refused_raises_its_reason(monkeypatch: py
     monkeypatch.setattr(update, "plan_or_refusal", lambda *_: board)
     with pytest.raises(DowngradeError, match="It is older"):
         plan_update(none, none, bytes(10), none, SilentReporter())
+    planned: Any = object()
+    monkeypatch.setattr(update, "plan_or_refusal", lambda *_: planned)
+    assert plan_update(none, none, bytes(10), none, SilentReporter()) is planned
 
 
 def test_a_board_that_reports_no_firmware_or_does_not_manage_it_takes_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1481,6 +1484,9 @@ def test_an_image_that_the_board_does_not_show_after_the_upload_is_not_tried(mon
         course.append("upload")
         return len(octets)
 
+    steps, moments = list[Any](), list[float]()
+    made._reporter = SimpleNamespace(started=steps.append, finished=steps.append, written=None)
+    monkeypatch.setattr(update, "time", SimpleNamespace(monotonic=lambda: moments.pop(0)))
     manager: Any = SimpleNamespace(
         images=lambda: shown.pop(0), upload=upload, start_next=lambda digest: course.append(digest.hex()[:4])
     )
@@ -1490,17 +1496,21 @@ def test_an_image_that_the_board_does_not_show_after_the_upload_is_not_tried(mon
     for images, done in (
         ([[other], [other]], None),
         ([[other], [running]], None),
-        ([[other], [ours]], ["upload", made._digest.hex()[:4]]),
+        ([[other], [other, ours]], ["upload", made._digest.hex()[:4]]),
+        ([[running], [running, ours]], ["upload", made._digest.hex()[:4]]),
         ([[other, ours]], [made._digest.hex()[:4]]),
     ):
-        shown[:], course[:] = images, []
+        shown[:], course[:], steps[:], moments[:] = images, [], [], [100.0]
         if done is None:
             with pytest.raises(NotAuthenticError, match="does not show the image that was sent"):
                 made._upload(none, manager)
             assert course == ["upload"]
         else:
+            moments[:], made._octets = [100.0, 103.5], 0
             made._upload(none, manager)
             assert course == done
+            detail = "1000 octets" if "upload" in done else "already on the board"
+            assert steps == ["upload", StepResult("upload", seconds=3.5, detail=detail)]
 
 
 def test_a_board_that_does_not_come_back_from_its_trial_is_lost_after_the_wait(monkeypatch: pytest.MonkeyPatch) -> None:
