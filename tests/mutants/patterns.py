@@ -4508,6 +4508,50 @@ C_PATTERNS = (
         "(void)teds_sessions_poll(node, now);",
         _C_TESTS,
     ),
+    CPattern(
+        "a stored reply goes with its link",
+        "links.c",
+        "            each->used = false;",
+        "            each->used = true;",
+        "tests/firmware/test_lost_links.py",
+    ),
+    CPattern(
+        "a reader that activates the tag anew selects the service anew",
+        "tnep.c",
+        "    if (present) {\n        node->nfc.selected = false;\n",
+        "    if (present) {\n",
+        "tests/firmware/test_nfc_beside_python.py",
+    ),
+    CPattern(
+        "each event sensor has its own ring",
+        "stream.c",
+        "        events->reported = lost;\n        events++;\n",
+        "        events->reported = lost;\n",
+        "tests/firmware/test_operation_suites.py",
+    ),
+    CPattern(
+        "staging that gives way leaves nothing to the next session",
+        "teds_commands.c",
+        "    if (elsewhere) {\n        teds_staging_drop(node);\n    }\n",
+        "",
+        "tests/firmware/test_protocol_suites.py",
+    ),
+    CPattern(
+        "a dead-man ends the claim of the first channel too",
+        "operation.c",
+        "    for (int i = 0; i < (int)node->port->channel_count; i++) {\n"
+        "        if (teds_is_actuator(node, i) && node->actuator_of[i] != NULL) {\n            if (now",
+        "    for (int i = 1; i < (int)node->port->channel_count; i++) {\n"
+        "        if (teds_is_actuator(node, i) && node->actuator_of[i] != NULL) {\n            if (now",
+        "tests/firmware/test_operation_suites.py",
+    ),
+    CPattern(
+        "a node that moved answers nobody at its old address",
+        "can.c",
+        "        found = own == node->can.address ? found : NULL;\n",
+        "",
+        _C_TESTS,
+    ),
 )
 
 SCRIPT_PATTERNS = (
