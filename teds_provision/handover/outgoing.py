@@ -508,8 +508,7 @@ def _other_holders(station: Station, nodes: Chosen, receivers: tuple[TrustRecord
 
 
 def _is_same(row: Handover, content: str, now: datetime) -> bool:
-    if row.direction != "out" or row.state != OPEN:
-        return False
+    """Return True if an open bundle of this content is carried on; a copy only until it expires."""
     notes = BundleNotes.from_json(row.nodes)
     return notes.content == content and (row.mode == "move" or datetime.fromisoformat(notes.expires) > now)
 

@@ -519,6 +519,11 @@ def test_a_private_key_in_the_keys_folder_is_found_in_every_form(system: System,
     folder.mkdir(parents=True)
     (folder / "bench.pem").write_text(to_pem(SoftwareKey.generate().point))
     (folder.parent / "README.md").write_text("Public keys only.\n")
+    (folder / "public.jwk").write_bytes(b'{"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA"}')
+    (folder / "words.json").write_bytes(b'{"d": 1, "k": 2}')
+    (folder / "certificate.der").write_bytes(b"\x30\x82\x01\x02\x30\x81\xa9\x02\x01\x02")
+    (folder / "other.bin").write_bytes(b"\x31\x02\x01\x00\x30\x02\x01\x01\x04\x20")
+    (folder / "gone.pem").symlink_to(folder / "nothing.pem")
     assert look(system, "keys folder")[0].result == "ok"
     (folder / name).write_bytes(private_keys()[name])
     (keys,) = look(system, "keys folder")

@@ -229,6 +229,14 @@ def test_a_draft_that_a_spare_loses_is_named_before_and_after(
     assert plan_takeover(station, OLD, NEW, copy_calibration=False).warnings == (), "it stays: nothing is taken over"
 
 
+def test_a_draft_that_was_written_is_none_that_a_spare_loses(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    station.pins.put(WhitelistEntry(NEW))
+    station.nodes.put(NodeRecord(OLD, NODE.point))
+    station.datasheets.keep_draft(Draft(NEW, Image(NEW, {(0, 1): b"x"}), "signed", None, "2026-01-31T12:00:00Z"))
+    monkeypatch.setattr(life, "pending_image", lambda _station, uuid, has: None if (uuid, has) == (NEW, None) else has)
+    assert plan_takeover(station, OLD, NEW, copy_calibration=False).draft is None
+
+
 def test_a_calibration_that_cannot_be_built_in(station: Station) -> None:
     station.pins.put(WhitelistEntry(NEW))
     station.nodes.put(NodeRecord(OLD, NODE.point))
