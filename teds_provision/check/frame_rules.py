@@ -105,19 +105,21 @@ class _Stranger:
                 return control.octets[1], gap_seconds(control.octets[2])
         raise RuleBrokenError("The first frame of a long request got ten flow controls with Wait.")
 
-    def request(self, body: bytes, bend: Callable[[int, bytes], bytes] = lambda _, data: data) -> bool:
-        """Send a request; ``bend`` changes a consecutive frame, counted from 1. False if the node asks for no more."""
+    def request(self, body: bytes, bend: Callable[[int, bytes], bytes] = lambda _, data: data) -> None:
+        """Send a request, up to where the node asks for no more.
+
+        ``bend`` changes a consecutive frame, counted from 1.
+        """
         if len(body) <= (62 if self.fd else 7):
             self.send(single(body, fd=self.fd))
-            return True
+            return
         block, gap = self.began(body)
         rest = list(consecutive_frames(first_frame(body, fd=self.fd)[1], fd=self.fd))
         for number, data in enumerate(rest, 1):
             self.send(bend(number, data))
             time.sleep(gap)
             if block and number % block == 0 and number < len(rest) and self.next(_QUIET, _FLOW) is None:
-                return False
-        return True
+                return
 
     def reply(self, seconds: float = _ANSWER) -> bytes | None:
         """Return a whole reply, transaction first; None if none begins."""
@@ -184,9 +186,8 @@ def can_other_address(probe: Probe) -> str:
             if frame is None:
                 continue
             source = frame.identifier & 0xFF
-            stranger.node = source
+            stranger.node = source  # which the flow control goes to
             came = read_single(frame.octets) or stranger.rest_of(frame)
-            stranger.node = home
             reply = decode_reply(came[1:])
             other = reply.ok and Identity.decode(reply.payload).uuid != probe.uuid
             text = f"Identify (128.7) to CAN address {address}: the node at {home} answers, from address {source}."

@@ -97,7 +97,7 @@ def can_busy(probe: Probe) -> str:
         f"The first frame of {_HALF_SENT} octets: {first.hex() or 'nothing'} came, not a flow control.",
     )
     second = other.begin(_HALF_SENT)
-    refused = read_single(second) if second else None
+    refused = read_single(second)
     fine = second[:1] in (b"\x30", b"\x31") or (refused is not None and refused[1:] == refusal(Reason.BUSY).encode())
     came = second.hex() or "nothing"
     due = "a flow control, or a single frame with refusal 17, is due"

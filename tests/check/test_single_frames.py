@@ -25,7 +25,7 @@ UUID = bytes(range(10))
 CRC = bytes.fromhex("456cd746")
 GREATEST_CRC = bytes.fromhex("0000000000005c5e3d4e")
 """A UUID whose CRC-32 is FFFFFFFF."""
-TEDS = bytes(octet * 7 & 0xFF for octet in range(60))
+TEDS = bytes(octet * 7 & 0xFF for octet in range(300))
 IDENTITY = Identity(UUID, NodeState.KEYED, 4, 2, 1024, 17).encode()
 
 
@@ -41,14 +41,14 @@ class Node:
     of_everyone: dict[str, str] = field(default_factory=dict)
     """Answers to functional frames, by the octets of the command."""
     odd: dict[str, str] = field(default_factory=dict)
-    """Answers to frames of a wrong length, by their first two octets."""
+    """Answers to frames of a wrong length, by their first two octets; a frame in place of the answer to Identify."""
     controls: list[str] = field(default_factory=lambda: ["300000"])
     """Flow controls after a first frame; one more each time a block has come."""
     more: list[str] = field(default_factory=lambda: ["300000"])
     in_sequence: int | None = 0
     """How many requests out of sequence are run all the same; None for all."""
     identify: Callable[[int], bytes] = lambda transaction: bytes([transaction, 1, 0, len(IDENTITY)]) + IDENTITY
-    read: Callable[[int], bytes] = lambda transaction: bytes([transaction, 1, 0, 64, 0, 0, 0, 0]) + TEDS
+    read: Callable[[int], bytes] = lambda transaction: bytes([transaction, 1, 1, 48, 0, 0, 0, 0]) + TEDS
     waits: bool = True
     block: Callable[[int], int] = lambda block: block
     gap: float = 0.05
@@ -141,6 +141,9 @@ class Node:
 
     def _run(self, body: bytes, node: int) -> None:
         source, reply = self.home, b""
+        if body[3:5] == b"\x80\x07" and "identify" in self.odd:
+            self._say(self.odd["identify"])
+            return
         if body[3:5] == b"\x80\x07":
             reply = self.identify(body[0])
             if node in self.also_at:
@@ -258,6 +261,12 @@ GOOD = [
     ("can_flow_obeyed", {"gap": 0.2}, "waits; blocks of 3, 200 ms between frames at STmin 50"),
     ("can_flow_obeyed", {"lost": (2, 2)}, "waits; blocks of 3, 50 ms between frames at STmin 50"),
     ("can_flow_obeyed", {"lost": (9, 2)}, "waits; blocks of 3, 50 ms between frames at STmin 50"),
+    (
+        "can_flow_obeyed",
+        {"read": lambda transaction: bytes([transaction, 1, 0, 104, 0, 0, 0, 0]) + TEDS[:100]},
+        "waits; blocks of 3, 50 ms between frames at STmin 50",
+    ),
+    ("can_pressed", {"announces": [(0xF511, "0101456cd7460000")]}, "neither moves nor announces"),
     ("can_announce", {"announces": [(HOME, f"0101{CRC.hex()}0000")]}, "announces CRC 456cd746, keyed"),
     ("can_announce", {"announces": [(HOME, f"0101{CRC.hex()}ffff")]}, "announces CRC 456cd746, keyed"),
     (
@@ -312,8 +321,8 @@ BROKEN = [
     ),
     (
         "can_functional",
-        {"of_everyone": {"8003": "1013030100000e00", "8005": "0504000000cccccc"}},
-        "Open (128.3), 0 octets, functional: 1013030100000e00 came; only Identify is answered.",
+        {"of_everyone": {"8003": "1108030100000e00", "8005": "0504000000cccccc"}},
+        "Open (128.3), 0 octets, functional: 1108030100000e00 came; only Identify is answered.",
     ),
     (
         "can_functional",
@@ -345,6 +354,11 @@ BROKEN = [
     (
         "can_sequence",
         {"identify": lambda transaction: bytes([transaction - 1]) + SAME},
+        "Identify (128.7) after a request out of sequence: no reply.",
+    ),
+    (
+        "can_sequence",
+        {"odd": {"identify": "2101010000000000"}},
         "Identify (128.7) after a request out of sequence: no reply.",
     ),
     ("can_sequence", {"controls": []}, "The first frame of a long request got no flow control."),
@@ -380,15 +394,15 @@ BROKEN = [
         {"lost": (2, 3)},
         "Block size 3 was asked for, 2 frames came. A WAIT before it may have ended the reply.",
     ),
-    ("can_flow_obeyed", {"lost": (9, 3)}, "A reply of 68 octets ended after 62."),
+    ("can_flow_obeyed", {"lost": (9, 3)}, "A reply of 308 octets ended after 307."),
     (
         "can_flow_obeyed",
-        {"read": lambda transaction: bytes([transaction, 1, 0, 64, 0, 0, 0, 0]) + TEDS[:59] + b"?"},
+        {"read": lambda transaction: bytes([transaction, 1, 1, 48, 0, 0, 0, 0]) + TEDS[:299] + b"?"},
         "Read (1.2) of the Security TEDS, in blocks: another reply came than in one piece.",
     ),
     (
         "can_flow_obeyed",
-        {"read": lambda transaction: bytes([transaction + 1, 1, 0, 64, 0, 0, 0, 0]) + TEDS},
+        {"read": lambda transaction: bytes([transaction + 1, 1, 1, 48, 0, 0, 0, 0]) + TEDS},
         "Read (1.2) of the Security TEDS, in blocks: another reply came than in one piece.",
     ),
     (
@@ -606,9 +620,24 @@ def test_frames_for_other_stations_of_other_nodes_and_without_octets_are_passed_
 
     def beside(octets: bytes, *where: Any) -> None:
         node.out.extend(noise)
+        if octets[0] >> 4 == 2:
+            put(b"\x30\0\0")
         put(octets, *where)
 
     node._put = beside  # type: ignore[method-assign, assignment]
     assert _found("can_flow_obeyed", node, clock) == "waits; blocks of 3, 50 ms between frames at STmin 50"
     node.out.extend(noise)
     assert _found("can_functional", node, clock) == "List, Open and Close of everyone get no reply"
+
+
+def test_a_stranger_counts_its_requests_and_writes_one_frame_while_one_is_enough() -> None:
+    """Transactions are 1 to 255 in turn; 7 octets fit a classic single frame, 62 one of CAN FD."""
+    node = Node(controls=[])
+    stranger = frame_rules._Stranger(node, HOME, OWN)
+    assert [stranger.transaction() for _ in range(256)] == [*range(1, 256), 1]
+    for fd, octets in ((False, 7), (True, 62)):
+        node.fd = stranger.fd = fd
+        stranger.request(bytes(octets))
+        with pytest.raises(RuleBrokenError, match="no flow control"):
+            stranger.request(bytes(octets + 1))
+    assert [frame[9:13] for frame in node.sent] == ["0700", "1008", "003e", "103f"]
