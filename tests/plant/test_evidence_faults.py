@@ -309,3 +309,36 @@ def test_evidence_has_at_most_a_mebibyte() -> None:
     with pytest.raises(BadDataError) as error:
         codec.read(b" " * 1_048_576)
     assert "at most" not in error.value.message
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (0, True), (4294967295, True), ("", True), (None, True), ([], True), ([[[["a", 1, None]]]], False),
+        ([[[["a"]]]], False), ([[["a", 1, None]]], True), ({"a": {"b": {"c": 1}}}, True),
+        ({"a": {"b": {"c": {"d": 1}}}}, False), (-1, False), (4294967296, False), (True, False), (False, False),
+        (1.0, False), ([1, [2.5]], False), ([-1], False), ({"a": 4294967296}, False), (b"a", False), ((1,), False),
+    ],
+)  # fmt: skip
+def test_facts_hold_texts_whole_numbers_lists_and_null(value: object, plain: bool) -> None:
+    """What RFC 8785 spells in one way; numbers of 32 bits, four levels deep with the facts themselves."""
+    if plain:
+        codec._require_plain({"a": value})
+        return
+    with pytest.raises(BadDataError) as no:
+        codec._require_plain({"a": value})
+    assert no.value.message == "The facts hold something else than texts, whole numbers, lists and null."
+
+
+def test_half_a_surrogate_pair_has_no_form_that_could_be_signed() -> None:
+    with pytest.raises(BadDataError) as no:
+        codec.canonical({"unit": "\ud800"}, [])
+    assert no.value.message == "A text of the evidence is not Unicode."
+
+
+def test_a_statement_of_separators_alone_is_not_read() -> None:
+    """Each costs an object: 40,000 are read, and no more."""
+    for number, words in ((40_000, "The statement"), (40_001, "far more members than evidence")):
+        with pytest.raises(BadDataError) as no:
+            codec._statement(b"[" + b"0," * (number - 1) + b"0]", "", b"")
+        assert words in no.value.message, no.value.message

@@ -262,6 +262,25 @@ def test_composing_names_the_argument_at_fault():
         compose_command(1, 1, 1, {"access_code": 3, "colour": 1})
     with pytest.raises(BadDataError, match=r"no command 1\.99"):
         compose_command(1, 1, 99)
+    for group, function, bad, cause in (
+        (
+            1,
+            3,
+            {"access_code": 3, "offset": 0, "octets": 5},
+            "The argument 'octets' of Write TEDS segment does not fit octets: 5.",
+        ),
+        (
+            1,
+            3,
+            {"access_code": 3, "offset": 0, "octets": "a"},
+            "The argument 'octets' of Write TEDS segment does not fit octets: 'a'.",
+        ),
+        (128, 2, {"tag": bytes(15)}, f"The argument 'tag' of Confirm does not fit o16: {bytes(15)!r}."),
+        (128, 2, {"tag": bytes(17)}, f"The argument 'tag' of Confirm does not fit o16: {bytes(17)!r}."),
+    ):
+        with pytest.raises(BadDataError) as no:
+            compose_command(1, group, function, bad)
+        assert no.value.message == cause
 
 
 @given(st.binary(max_size=300))
@@ -369,6 +388,10 @@ def test_type_codes_of_tagged_arguments_are_1_to_21(tag, fits):
         ("05c8010000", "network-service", "Service 200, command", []),
         ("09c8010000", "network-service", "Service 200, command", []),
         ("08c8010000", "unknown", "", ["not-a-message"]),
+        ("0500010000", "unknown", "", ["not-a-message"]),
+        ("05c8010001", "unknown", "", ["not-a-message"]),
+        ("05c801000100", "network-service", "Service 200, command", []),
+        ("05c8090000", "unknown", "", ["not-a-message"]),
     ],
 )
 def test_a_message_is_what_its_header_and_length_fit(octets, kind, name, findings):

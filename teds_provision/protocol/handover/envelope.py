@@ -163,7 +163,7 @@ def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:
     check_size(size, max_octets, "the sealed document")
     file.seek(0)
     outline = _Outline()
-    while outline.octets < size and (piece := file.read(min(size - outline.octets, PIECE))):
+    while piece := file.read(min(size - outline.octets, PIECE)):
         outline.feed(piece)
     document, first, last = parse_document(bytes(outline.text)), outline.first, outline.last
     before, found, after = _cut(document.pop("ciphertext", None), outline.mark.decode())

@@ -13,7 +13,7 @@ from teds_provision.protocol.operation.can_frames import DataAddress, Segment, b
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
 from teds_provision.protocol.operation.datagram import LAST_COUNTER, DatagramSealer, Layout, pattern, stream_key
 from teds_provision.protocol.operation.hardware import Hardware, SessionPort
-from teds_provision.protocol.operation.stream_commands import WAITS, StreamKind, SubscribeCommand
+from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeCommand
 from teds_provision.protocol.session import NodeSession
 
 MICRO: Final = 1000
@@ -212,8 +212,3 @@ class Sender:
 def gap(streams: list[Stream]) -> int:
     """Return the largest gap of the streams of a bus, at least 1 µs, in ns."""
     return max([1, *(stream.asked.gap for stream in streams)]) * MICRO
-
-
-def waits(start: int) -> bool:
-    """Return True if a start means that the stream waits for a trigger."""
-    return start == WAITS

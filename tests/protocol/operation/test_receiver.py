@@ -315,6 +315,8 @@ def test_how_many_messages_had_begun_at_a_tick() -> None:
     taker = receiver()
     found = [taker.begun(START + tick) for tick in (-1, 0, 20 * MS - 1, 20 * MS, 65 * MS)]
     assert found == [0, 1, 1, 2, 4]
+    waiting, events = receiver(start=WAITS), receiver(kind=StreamKind.EVENT)
+    assert [each.begun(START + 65 * MS) for each in (waiting, events)] == [0, 0]
 
 
 def test_only_bits_0_and_7_of_the_flags_mean_something() -> None:

@@ -1,0 +1,215 @@
+"""Edges of keys, signatures, messages and documents that nothing ordinary reaches: each is refused in its words."""
+
+from __future__ import annotations
+
+import base64
+import sys
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
+from teds_provision.protocol import datasheet
+from teds_provision.protocol.announce import AddressClaim, Announce
+from teds_provision.protocol.handover import bundle as bundles
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_pieces
+from teds_provision.protocol.handover.strict_json import base64url, dump
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem, node_key_message, to_pem, verify_each_once
+from teds_provision.protocol.messages import smp
+from teds_provision.protocol.messages.message import compose_command, compose_service
+from teds_provision.protocol.plant.signing import require_name
+from teds_provision.protocol.session import unpad
+from teds_provision.protocol.wire_agreement import StationAgreement
+from teds_provision.teds.codec import security
+from tests.protocol.desk import CREDENTIALS, UUID
+from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, STRANGER, bundle, node, trusts
+
+KEY = SoftwareKey(77)
+
+
+@pytest.mark.parametrize(
+    ("padded", "octets"),
+    [
+        ("", None),
+        ("01" * 15, None),
+        ("aa" * 15 + "01", "aa" * 15),
+        ("10" * 16, ""),
+        ("aa" * 16 + "10" * 16, "aa" * 16),
+        ("aa" * 13 + "030303", "aa" * 13),
+        ("aa" * 13 + "020303", None),
+        ("aa" * 15 + "00", None),
+        ("11" * 32, None),
+        ("aa" * 16 + "01", None),
+    ],
+)
+def test_a_padding_is_1_to_16_octets_that_count_themselves(padded: str, octets: str | None) -> None:
+    """RFC 5652 section 6.3."""
+    assert unpad(bytes.fromhex(padded)) == (None if octets is None else bytes.fromhex(octets))
+
+
+def _pem(octets: bytes) -> bytes:
+    return b"-----BEGIN PUBLIC KEY-----\n" + base64.b64encode(octets) + b"\n-----END PUBLIC KEY-----\n"
+
+
+def _public(key: Any) -> bytes:
+    form = serialization.PublicFormat.SubjectPublicKeyInfo
+    return bytes(key.public_key().public_bytes(serialization.Encoding.PEM, form))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            b"-----BEGIN EC PRIVATE KEY-----\n",
+            "This file holds a private key where a public one belongs.",
+        ),
+        (
+            _pem(bytes.fromhex("300a" "3005" "0603" "2a0304" "0301" "00")),
+            "This is no P-256 key: its kind is not known here; stations and CAs have P-256 keys.",
+        ),
+        (b"no PEM", "This file holds no public key in PEM form."),
+        (_pem(b"\x30\x00"), "This file holds no public key in PEM form."),
+        (
+            _public(ed25519.Ed25519PrivateKey.from_private_bytes(bytes(32))),
+            "This is not a P-256 key; stations and CAs have P-256 keys.",
+        ),
+        (
+            _public(ec.derive_private_key(5, ec.SECP384R1())),
+            "This is not a P-256 key; stations and CAs have P-256 keys.",
+        ),
+    ],
+    ids=["private", "unknown kind", "no PEM", "no key", "Ed25519", "P-384"],
+)  # fmt: skip
+def test_a_public_key_of_a_file_is_one_of_p_256(text: bytes, words: str) -> None:
+    with pytest.raises(BadDataError) as no:
+        from_pem(text)
+    assert no.value.message == words
+    assert from_pem(to_pem(KEY.point).encode()) == KEY.point
+
+
+def test_signatures_of_a_point_that_is_none_are_all_wrong() -> None:
+    good = (b"one", KEY.sign(b"one"))
+    assert verify_each_once(KEY.point, [good, (b"two", good[1])]) == [True, False]
+    assert verify_each_once(b"\x04" + bytes(64), [good, good]) == [False, False]
+
+
+def test_a_datasheet_that_nobody_signed_has_no_good_signature() -> None:
+    node_signature = KEY.sign(node_key_message(UUID, KEY.point))
+    octets = security.initial(KEY.point, node_signature, sequence=0, key_epoch=1)
+    shown = security.decode(octets)
+    for unsigned in (shown, replace(shown, station_key=KEY.point), replace(shown, signature=bytes(64))):
+        assert not datasheet.signature_good(unsigned, octets, UUID)
+        assert not datasheet.signature_good(unsigned, octets, UUID, lambda *_: True)
+        assert not datasheet.message_signature_good(unsigned, b"message")
+        assert not datasheet.message_signature_good_once(unsigned, b"message")
+    good = datasheet.sign_datasheet(replace(shown, station_key=CREDENTIALS.key.point), UUID, CREDENTIALS)
+    signed, asked = security.decode(good), list[Any]()
+
+    def chip(*given: bytes) -> bool:
+        asked.append(given)
+        return True
+
+    assert datasheet.signature_good(signed, good, UUID)
+    assert datasheet.signature_good(signed, good, UUID, chip)
+    assert asked == [(CREDENTIALS.key.point, security.tbs(UUID, good), signed.signature)]
+    assert not datasheet.signature_good(signed, good, bytes(10))
+    assert not datasheet.signature_good(signed, good, UUID, lambda *_: False)
+    assert datasheet.message_signature_good_once(signed, security.tbs(UUID, good))
+    assert datasheet.message_signature_good(signed, security.tbs(UUID, good))
+    assert not datasheet.message_signature_good_once(signed, b"message")
+
+
+@pytest.mark.parametrize("own", ["station", "one-time"])
+def test_a_node_that_shows_a_key_of_the_station_is_not_agreed_with(own: str) -> None:
+    """Else a station would agree with its own reflection."""
+    one_time = SoftwareKey(78)
+    key = CREDENTIALS.key if own == "station" else one_time
+    teds = security.initial(key.point, key.sign(node_key_message(UUID, key.point)), sequence=0, key_epoch=1)
+    with pytest.raises(NotAuthenticError, match="The key that the node shows is this station's own"):
+        StationAgreement(CREDENTIALS, UUID, one_time=one_time).accept(bytes(165), teds, pinned=None, epoch=0)
+
+
+def test_a_node_that_hears_every_address_keeps_its_own() -> None:
+    claim = AddressClaim(6, uniform=lambda low, _high: low)
+    for source in range(1, 240):
+        claim.hear(source)
+    assert claim.handle_announce(Announce(33, 0, 5), 33, 1.0) == 33
+
+
+# -- documents ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_bundle_holds_as_many_nodes_as_it_was_to_hold() -> None:
+    made = bundle()
+    with pytest.raises(BadDataError) as no:
+        b"".join(payload_pieces(made, iter([node(1), node(2)]), 3))
+    assert no.value.message == "The bundle was to hold 3 different nodes, and holds 2."
+    with pytest.raises(BadDataError) as no:
+        b"".join(payload_pieces(made, iter([node(1), node(1)]), 2))
+    assert no.value.message == "The bundle was to hold 2 different nodes, and holds 1."
+
+
+def test_a_bundle_is_no_longer_than_its_receiver_reads() -> None:
+    """64 MiB sealed, of which the payload has 9 octets in 16 at most, after 128 KiB for the rest."""
+    most, piece = (64 * 1024 * 1024 - 128 * 1024) // 16 * 9, bytes(1 << 20)
+    pieces = [piece] * (most >> 20) + [bytes(most & 0xFFFFF)]
+    assert sum(len(out) for out in bundles._within(pieces, 9)) == most
+    with pytest.raises(BadDataError) as no:
+        list(bundles._within([*pieces, b"1"], 12345))
+    assert (no.value.message, no.value.hint) == ("12345 nodes are too many for one bundle.", "Export them in groups.")
+
+
+def test_a_payload_that_is_no_base64url_is_a_fault_only_after_its_signature() -> None:
+    """What nobody signed is not believed, and so not named either."""
+    head = base64url(dump({"alg": "ES256", "kid": fingerprint(SENDER.point), "typ": TYPE}))
+    for text in (b"*", b"QQ=="):
+        message = head + b"." + text
+        for signer, error in ((SENDER, BadDataError), (STRANGER, NotAuthenticError)):
+            jws = message + b"." + base64url(signer.sign(message))
+            with pytest.raises(error) as no:
+                open_bundle(jose.encrypt(jws, [RECEIVER.point], cty="JWS"), RECEIVER, trusts(SENDER), NOW)
+            assert ("base64url" in no.value.message) == (signer is SENDER)
+
+
+@pytest.mark.parametrize("name", ["", " a", "a ", "a\tb", "a" * 101, "a\x85", "\u202e"])
+def test_a_name_in_a_request_is_printable_and_has_no_space_at_its_ends(name: str) -> None:
+    with pytest.raises(BadDataError) as no:
+        require_name(name)
+    assert no.value.message == (
+        f"The name {name!r} is none of 1 to 100 printable characters without space at either end."
+    )
+
+
+@pytest.mark.parametrize("name", [None, "a", "a" * 100, "links, rechts", "größe"])
+def test_any_other_name_may_stand_in_a_request(name: str | None) -> None:
+    require_name(name)
+
+
+# -- messages ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_message_is_not_composed() -> None:
+    with pytest.raises(BadDataError) as no:
+        compose_service(99, 1, 1, {})
+    assert no.value.message == "There is no network service 99.1 with message type 1."
+    with pytest.raises(BadDataError) as no:
+        compose_service(1, 1, 9, {})
+    assert no.value.message == "There is no network service 1.1 with message type 9."
+    long: dict[str, Any] = {"access_code": 3, "offset": 0, "octets": bytes(65_530)}
+    assert len(compose_command(1, 1, 3, long)) == 6 + 65_535
+    with pytest.raises(BadDataError) as no:
+        compose_command(1, 1, 3, long | {"octets": bytes(65_531)})
+    assert no.value.message == "Write TEDS segment would carry 65536 octets; a message carries at most 65535."
+
+
+def test_an_update_without_cbor2_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert smp.decode_map(b"\xa1\x61a\x01") == {"a": 1}
+    monkeypatch.setitem(sys.modules, "cbor2", None)
+    with pytest.raises(NotFoundError) as no:
+        smp.decode_map(b"\xa0")
+    assert no.value.message == "Firmware updates need the package cbor2."
+    assert "[update]" in (no.value.hint or "")
