@@ -300,6 +300,10 @@ def test_of_another_streams_older_bucket_nothing_is_added_to_the_hull() -> None:
     assert hull.points() == [(3 * BUCKET + 1, 800)]
     assert not hull.add_arrival(3 * BUCKET, 700), "a little older, and of the same bucket"
     assert hull.points() == [(3 * BUCKET, 700)]
+    assert not hull.add_arrival(3 * BUCKET + 2, 701), "it came later after its samples than the best one"
+    assert hull.points() == [(3 * BUCKET, 700)]
+    assert not hull.add_arrival(2**63, 1), "292 years after the start of a node"
+    assert hull.points() == [(3 * BUCKET, 700)]
 
 
 def test_a_clock_that_is_followed_anew_is_apart_from_the_systems_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,3 +353,35 @@ def test_the_wall_clock_is_the_narrowest_of_some_readings_and_a_step_is_seen_by_
         monkeypatch.setattr(WallClock, "now", now)
         assert host.was_set() is was_set
         assert asked == list(offsets)
+
+
+def test_the_line_of_a_block_is_that_of_the_map_while_a_refit_is_phased_in() -> None:
+    """Over the second after a refit its difference fades: begin and slope of a line follow that, to the nanosecond."""
+    clock = ClockMap()
+    clock.exchange(Exchange(10**9, 10**9 + 2000, 500, 1500, 1, 20))
+    clock.host_of(10**6)
+    clock._residue, clock._refitted = 40_000.0, 2 * 10**9  # 40 us, as after a refit
+    for first in (2 * 10**9 - 5, 2 * 10**9, 2 * 10**9 + 5 * 10**8, 3 * 10**9 - 1, 3 * 10**9, 4 * 10**9):
+        begin, rate, _ = clock.line(first, first + 1000)
+        assert begin / 1e9 == pytest.approx(clock.host_of(first), abs=2e-9)
+        slews = 2 * 10**9 <= first < 3 * 10**9
+        assert rate - 1.0 == pytest.approx(-40e-6 if slews else 0.0, abs=1e-9), first
+
+
+def test_stamps_of_a_line_are_held_back_only_where_they_would_go_back() -> None:
+    stamps = MonotonicStamps()
+    for times, held in (
+        ([1.0, 2.0], [1.0, 2.0]), ([1.5, 2.5], [2.0, 2.5]), ([2.5], [2.5]), ([4.0, 3.0], [4.0, 4.0]), ([3.5], [4.0]),
+        ([4.5], [4.5]),
+    ):  # fmt: skip
+        assert stamps.stamp_line(np.array(times)).tolist() == held
+
+
+def test_what_was_stamped_before_the_clock_was_set_is_moved_by_the_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    host = HostClock(WallClock(1000.0))
+    monkeypatch.setattr(WallClock, "now", lambda readings=9: WallClock(1060.0))
+    assert host.set_anew() == 60.0
+    monkeypatch.setattr(WallClock, "now", lambda readings=9: WallClock(1050.0))
+    assert host.set_anew() == -10.0
+    assert [host.since(number) for number in (0, 1, 2)] == [50.0, -10.0, 0.0]
+    assert host.present == (2, 1050.0)

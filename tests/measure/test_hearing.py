@@ -144,6 +144,19 @@ def test_a_stream_that_waited_for_its_trigger_was_not_silent_meanwhile() -> None
     assert scene.heard.last_good_at >= began
 
 
+def test_a_stream_was_last_good_when_a_message_with_the_right_tag_came() -> None:
+    scene = Scene()
+    scene.heard.last_good_at = before = time.monotonic() - 15.0
+    forged = scene.message(0)
+    scene.heard.queue_message(forged[:-1] + bytes([forged[-1] ^ 1]), scene.arrival(0))
+    scene.heard.finish()
+    assert scene.heard.last_good_at == before
+    began = time.monotonic()
+    scene.heard.queue_message(scene.message(1), scene.arrival(1))
+    scene.heard.finish()
+    assert scene.heard.last_good_at >= began
+
+
 def test_what_waited_for_12_ms_is_handed_on_and_not_before() -> None:
     scene = Scene()
     before = time.monotonic()

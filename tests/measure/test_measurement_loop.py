@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,11 +21,12 @@ from teds_provision.errors import (
     StoreError,
     TedsProvisionError,
 )
-from teds_provision.measure.blocks import ChannelFacts, SinkStats, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, SinkStats, StationFacts
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running import measurement
 from teds_provision.measure.running.measurement import WAITING, Measurement
 from teds_provision.measure.running.streams import StreamTotals
+from tests.measure.sinks.parts import ARM, HAND, block
 
 
 def test_a_sink_that_waits_for_its_consumers_is_news_after_three_seconds_each_time_anew(
@@ -339,3 +342,55 @@ def test_a_measurement_that_a_person_stops_early_reports_no_node_as_absent(
     else:
         assert isinstance(error, NoNodeError)
         assert "did not answer before the measurement ended" in error.message
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_node_that_leaves_is_ended_with_the_reason_and_waited_for(begun: bool) -> None:
+    course = list[Any]()
+    one = supervisor_of(UUIDS[0], begun=begun, stop=course.append, join=course.append)
+    made = measurement_of(one)
+    made.leave(UUIDS[0], "gone")
+    made.leave(UUIDS[1], "never here")
+    assert course == (["gone", 10.0] if begun else [])
+    assert made.supervisors == [one], "its counts stay"
+
+
+def test_a_block_that_was_stamped_before_the_clock_was_set_has_the_new_time() -> None:
+    kept, seen = list[Block](), list[Block]()
+    sink: Any = SimpleNamespace(write=kept.append)
+    made = measurement_of(sinks=[sink], watcher=measurement.Watcher(block=seen.append))
+    made._setting, made._grids, made._for_grid = threading.Lock(), {}, deque()
+    made._host = SimpleNamespace(present=(2, 0.0), since=lambda number: {0: 60.0, 1: -2.5}[number])
+    for clock, moved in ((0, 60.0), (1, -2.5), (2, 0.0), (None, 0.0)):
+        given = replace(block([[1], [2]], start=1000.0), clock=clock)
+        made._block(given)
+        assert (kept[-1].time - given.time).tolist() == [moved] * 2
+        assert kept[-1].clock == (None if clock is None else 2)
+        assert seen[-1] is kept[-1]
+        assert made._for_grid == deque(), "no sink wants rows"
+    made._grids = {"": object()}
+    made._block(given)
+    assert list(made._for_grid) == [given]
+
+
+@pytest.mark.parametrize("newcomers", [False, True])
+def test_rows_are_made_of_every_node_together_or_of_each_alone_where_nodes_come_and_go(newcomers: bool) -> None:
+    class Grid:
+        def __init__(self) -> None:
+            self.blocks: list[str] = []
+
+        def add_block(self, block: Block) -> None:
+            self.blocks.append(block.uuid)
+
+        def rows(self, now: float) -> object:
+            return (now, tuple(self.blocks)) if self.blocks else None
+
+    made = measurement_of(request=MeasurementRequest(newcomers=newcomers))
+    made._host = SimpleNamespace(now=lambda: 7.0)
+    made._for_grid = deque([block(uuid=ARM), block(uuid=HAND, channels=(2,)), block(uuid=ARM)])
+    made._grids = {ARM: Grid(), HAND: Grid(), "00": Grid()} if newcomers else {"": Grid()}
+    found = made._synchronized()
+    assert found == ([(7.0, (ARM, ARM)), (7.0, (HAND,))] if newcomers else [(7.0, (ARM, HAND, ARM))])
+    assert made._for_grid == deque()
+    made._grids, made._for_grid = {}, deque([block()])
+    assert made._synchronized() == [], "its grid is gone"

@@ -10,7 +10,17 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, PolicyError, StoreError
+from teds_provision.errors import (
+    BadDataError,
+    GarbledError,
+    KeyStolenError,
+    LinkError,
+    NodeRefusedError,
+    NoRoomError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+)
 from teds_provision.measure import node_supervisor
 from teds_provision.measure.blocks import NodeReport, SetPointCommand
 from teds_provision.measure.clock import HostClock
@@ -21,6 +31,7 @@ from teds_provision.measure.running import measurement_job
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.protocol.messages.frames import Reason
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.station.measurements import STATION
 from teds_provision.station.store.records import KeptMeasurement
 
@@ -594,3 +605,276 @@ def test_a_session_ends_with_actuators_then_streams_then_idle_as_far_as_the_node
     share.taken[UUID] = 0.3
     supervisor._end(bus, trusted, 0x21, answers=answers)
     assert share.taken == {UUID: 0.3, b"other": 0.1}, "it keeps its room while it is lent"
+
+
+@pytest.mark.parametrize(
+    ("ran", "timeout", "left", "seconds"),
+    [
+        (False, 60.0, 100.0, 60.0),
+        (False, 60.0, 12.34, 12.3),
+        (False, 60.0, 0.5, 2.0),
+        (False, 1.0, 100.0, 2.0),
+        (True, 60.0, 100.0, 2.0),
+    ],
+)
+def test_a_node_is_searched_until_the_timeout_and_two_seconds_at_a_time_after_its_first_value(
+    monkeypatch: pytest.MonkeyPatch, ran: bool, timeout: float, left: float, seconds: float
+) -> None:
+    supervisor = supervisor_at([100.0], monkeypatch, timeout=timeout)
+    supervisor.ever_ran = ran
+    asked: list[tuple[bytes, float, bool]] = []
+
+    def find(uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float) -> None:
+        asked.append((uuid, seconds, stop is supervisor._stop and fresh == supervisor._lost_at))
+
+    bus = SimpleNamespace(share=BusShare(cast(Any, None)))
+    buses = SimpleNamespace(presence=SimpleNamespace(find=find), bus_of=lambda _sighting: bus, all=lambda: [bus])
+    monkeypatch.setattr(supervisor, "_buses", buses)
+    monkeypatch.setattr(supervisor, "_retry_policy", SimpleNamespace(seconds_left=left))
+    for step in ("_let_others_finish", "_wait_for_vault"):
+        monkeypatch.setattr(supervisor, step, lambda: None)
+    monkeypatch.setattr(supervisor, "_in_session", lambda *_words: None)
+    standing = SimpleNamespace(require_measurable=lambda: None)
+    monkeypatch.setattr(node_supervisor, "NodeStanding", lambda _station, _uuid: standing)
+    supervisor._try_once()
+    assert asked == [(UUID, seconds, True)]
+
+
+class Session:
+    """A session of :meth:`NodeSupervisor._open_and_measure` without a node: ``fails`` is raised while it is kept."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, fails: Exception | None = None, **trusted: bool) -> None:
+        self.course: list[Any] = []
+        self.supervisor = supervisor_at([100.0], monkeypatch, unsigned=True, by="ncap", **self.asked(trusted))
+        self.trusted = SimpleNamespace(sheet="sheet", **{"unsigned": False, "unverified": False, **trusted})
+        node = SimpleNamespace(contact=SimpleNamespace(link=None), sealed=True)
+        self.standing: Any = SimpleNamespace(drives=None, unsigned=None)
+        self.bus: Any = SimpleNamespace(beginning={UUID})
+        presence = SimpleNamespace(on_announce=lambda *_words: self.course.append("announce"))
+        monkeypatch.setattr(self.supervisor, "_buses", SimpleNamespace(presence=presence))
+        monkeypatch.setattr(node_supervisor, "Conversation", lambda *_words, **_how: nullcontext(node))
+        monkeypatch.setattr(node_supervisor, "open_trusted", self.opens("signed"))
+        monkeypatch.setattr(node_supervisor, "open_unverified", self.opens("unverified"))
+        monkeypatch.setattr(node_supervisor, "read_firmware", lambda _node: "1.0")
+        monkeypatch.setattr(node_supervisor, "firmware_of", lambda _station, _uuid, read: read)
+        monkeypatch.setattr(
+            node_supervisor, "require_good_firmware", lambda _u, runs: self.course.append(("good?", runs))
+        )
+        monkeypatch.setattr(node_supervisor, "firmware_warning", lambda _runs: "old")
+        monkeypatch.setattr(self.supervisor, "_measure", lambda *_words: self.course.append("measure"))
+
+        def keep(*_words: Any) -> None:
+            self.course.append(("keep", set(self.bus.beginning), self.standing.drives, self.standing.unsigned))
+            if fails is not None:
+                raise fails
+
+        monkeypatch.setattr(self.supervisor, "_keep", keep)
+        monkeypatch.setattr(
+            self.supervisor, "_end", lambda _bus, _trusted, address, *, answers: self.course.append((address, answers))
+        )
+
+    @staticmethod
+    def asked(trusted: dict[str, bool]) -> dict[str, Any]:
+        return {"unverified": trusted.get("unverified", False), "require_firmware": trusted.get("unsigned", False)}
+
+    def opens(self, name: str) -> Any:
+        return lambda _station, _node, **how: self.course.append((name, how)) or self.trusted
+
+    def run(self) -> None:
+        sighting: Any = SimpleNamespace(contact=lambda: None, address=0x21)
+        self.supervisor._open_and_measure(self.bus, sighting, self.standing)
+
+
+@pytest.mark.parametrize(
+    ("trusted", "opened", "unsigned"),
+    [
+        ({}, ("signed", {"by": "ncap", "unsigned": True}), False),
+        ({"unsigned": True}, ("signed", {"by": "ncap", "unsigned": True}), True),
+        ({"unverified": True}, ("unverified", {"by": "ncap"}), True),
+    ],
+)
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_rights_of_a_node_in_its_session_are_those_of_its_datasheet(
+    monkeypatch: pytest.MonkeyPatch, trusted: dict[str, bool], opened: Any, unsigned: bool, moves: bool
+) -> None:
+    session = Session(monkeypatch, **trusted)
+    session.supervisor._driven = cast(Any, object()) if moves else None
+    session.run()
+    good = [("good?", "1.0")] if trusted.get("unsigned") else []
+    assert session.course == [
+        "announce", opened, *good, "measure", ("keep", set(), moves, unsigned), (0x21, True),
+    ]  # fmt: skip
+    assert session.supervisor._proven is True
+    assert session.supervisor._firmware_warning == "old"
+    assert session.supervisor.verified is session.trusted
+
+
+@pytest.mark.parametrize(
+    ("error", "stopped", "answers"),
+    [
+        (LinkError("It is silent."), False, False),
+        (LinkError("It is silent."), True, True),
+        (PolicyError("Off the list."), False, True),
+        (NotAuthenticError("Revoked."), False, True),
+        (BadDataError("Nonsense."), False, True),
+        (KeyStolenError("A new key."), False, True),
+        (StoreError("The disk is full."), False, False),
+    ],
+)
+def test_a_node_that_is_given_up_by_a_decision_answers_and_its_streams_are_stopped(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, stopped: bool, answers: bool
+) -> None:
+    session = Session(monkeypatch, error)
+    if stopped:
+        session.supervisor._stop.set()
+    with pytest.raises(type(error)):
+        session.run()
+    assert session.course[-1] == (0x21, answers)
+
+
+@pytest.mark.parametrize("news", [("", "a", "a", "b", ""), ("", "")])
+def test_a_mark_on_values_is_reported_each_time_that_it_changes(
+    monkeypatch: pytest.MonkeyPatch, news: tuple[str, ...]
+) -> None:
+    supervisor, told, marks = supervisor_at([0.0], monkeypatch), list[tuple[str, str]](), iter(news)
+    streams = SimpleNamespace(tell_time=lambda _t: None, silent=lambda _now: 0.0, clock=SimpleNamespace(lie=""))
+    monkeypatch.setattr(supervisor, "streams", streams)
+    monkeypatch.setattr(supervisor, "_set_state", lambda state, why="": told.append((state, why)))
+    standing: Any = SimpleNamespace(mark="")
+
+    def require() -> None:
+        mark = next(marks, None)
+        if mark is None:
+            supervisor.stop()
+        else:
+            standing.mark = mark
+
+    standing.require = require
+    none: Any = None
+    supervisor._watch(none, none, standing, None)
+    assert told == ([("running", "a"), ("running", "b"), ("running", "")] if len(news) > 2 else [])
+
+
+class Tries:
+    """A supervisor's one try, whose session proves the node (or not) and ends with an error; what follows, in order."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, error: BaseException | None = None, *, sealed: bool = True,
+        conflict: Exception | None = None,
+    ) -> None:  # fmt: skip
+        self.course: list[Any] = []
+        self.supervisor = supervisor_at([100.0], monkeypatch)
+        bus = SimpleNamespace(
+            share=BusShare(cast(Any, None)), discovery=SimpleNamespace(discover=self.does("broadcast"))
+        )
+        presence = SimpleNamespace(
+            find=lambda _uuid, **_how: "here", let_announce=self.does("let"), search_again=self.does("search"),
+            conflict_at=lambda sighting: self.course.append(("conflict?", sighting)) or conflict,
+        )  # fmt: skip
+        buses = SimpleNamespace(presence=presence, bus_of=lambda _sighting: bus, all=lambda: [bus])
+        monkeypatch.setattr(self.supervisor, "_buses", buses)
+        monkeypatch.setattr(self.supervisor, "_let_others_finish", self.does("others"))
+        monkeypatch.setattr(self.supervisor, "_wait_for_vault", self.does("vault"))
+        standing = SimpleNamespace(require_measurable=self.does("measurable?"))
+        monkeypatch.setattr(node_supervisor, "NodeStanding", lambda _station, _uuid: standing)
+
+        def session(*_words: Any) -> None:
+            self.course.append("session")
+            self.supervisor._proven = sealed
+            if error is not None:
+                raise error
+
+        monkeypatch.setattr(self.supervisor, "_in_session", session)
+
+    def does(self, name: str) -> Any:
+        return lambda *_words: self.course.append(name)
+
+
+BEFORE = ["others", "vault", "measurable?", "session"]
+
+
+def refusal(*, sealed: bool) -> NodeRefusedError:
+    error = NodeRefusedError("No.", reason=1)
+    error.sealed = sealed
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "sealed", "proven", "after"),
+    [
+        (NotAuthenticError("Revoked."), True, True, ["let"]),
+        (PolicyError("Off the list."), True, True, ["let"]),
+        (BadDataError("Nonsense."), True, True, ["let"]),
+        (refusal(sealed=True), True, True, ["let"]),
+        (refusal(sealed=False), True, False, ["let", "search", "broadcast", ("conflict?", "here")]),
+        (refusal(sealed=True), False, False, ["let", "search", "broadcast", ("conflict?", "here")]),
+        (NotAuthenticError("Another key."), False, False, ["let", "search", "broadcast", ("conflict?", "here")]),
+        (StoreError("The disk is full."), True, True, ["let", "search"]),
+        (LinkError("It is silent."), True, False, ["let", "search", ("conflict?", "here")]),
+        (LinkError("It is silent."), False, False, ["let", "search", ("conflict?", "here")]),
+        (SessionLostError(LinkError("Lost.")), True, False, ["let", "search", "broadcast", ("conflict?", "here")]),
+        (KeyboardInterrupt(), False, False, ["let", "search"]),
+    ],
+)
+def test_only_what_the_nodes_key_vouches_for_proves_that_it_is_here(
+    monkeypatch: pytest.MonkeyPatch, error: BaseException, sealed: bool, proven: bool, after: list[Any]
+) -> None:
+    """Any device can show its UUID and refuse: then it is searched again, and two nodes at one address are named."""
+    tries = Tries(monkeypatch, error, sealed=sealed)
+    with pytest.raises(type(error)) as raised:
+        tries.supervisor._try_once()
+    assert raised.value is error
+    assert (tries.course, tries.supervisor._proven) == ([*BEFORE, *after], proven)
+    assert tries.supervisor._lost_at == 100.0
+    two = PolicyError("Two nodes answer at address 0x21.")
+    again = Tries(monkeypatch, error, sealed=sealed, conflict=two)
+    with pytest.raises(type(two) if ("conflict?", "here") in after else type(error)) as raised:
+        again.supervisor._try_once()
+    assert (raised.value is two) == (("conflict?", "here") in after)
+    if raised.value is two:
+        assert two.__cause__ is error
+
+
+def test_a_try_waits_for_commands_and_for_the_vault_and_one_that_was_ended_meanwhile_finds_nobody(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    good = Tries(monkeypatch)
+    good.supervisor._try_once()
+    assert (good.course, cast(Any, good.supervisor.sighting)) == (BEFORE, "here")
+    ended = Tries(monkeypatch)
+    ended.supervisor._stop.set()
+    ended.supervisor._try_once()
+    assert ended.course == BEFORE[:2]
+    full = Tries(monkeypatch, NoRoomError("The bus is full."))
+    with pytest.raises(NoRoomError):
+        full.supervisor._try_once()
+    assert full.course == BEFORE, "the node is here, and is not searched"
+    for change in ({"ever_ran": True}, {"bus": None}, {"_request": MeasurementRequest(patient=True)}):
+        quiet = Tries(monkeypatch)
+        quiet.supervisor.bus = cast(Any, quiet.supervisor._buses.all()[0])
+        for name, value in change.items():
+            setattr(quiet.supervisor, name, value)
+        quiet.supervisor._ask_who_answers()
+        assert quiet.course == [], "only before its first value"
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_what_a_session_begins_with_counts_under_its_key_alone(monkeypatch: pytest.MonkeyPatch, sealed: bool) -> None:
+    """A link that can be given up gives up as soon as the node is gone; requirements are met before anything moves."""
+    session = Session(monkeypatch)
+    link: Any = SimpleNamespace(hopeless=lambda: False)
+    node = SimpleNamespace(contact=SimpleNamespace(link=link), sealed=sealed)
+    monkeypatch.setattr(node_supervisor, "Conversation", lambda *_words, **_how: nullcontext(node))
+    wanted = SimpleNamespace(offer=lambda uuid, sheet, stop: session.course.append((uuid, sheet)))
+    object.__setattr__(session.supervisor._request, "requirements", wanted)
+    session.run()
+    assert link.hopeless == session.supervisor._is_gone
+    assert session.supervisor._proven is sealed
+    assert session.course[2:4] == [(UUID, "sheet"), "measure"]
+    monkeypatch.setattr(
+        node_supervisor, "open_trusted", lambda *_words, **_how: (_ for _ in ()).throw(LinkError("No."))
+    )
+    session.supervisor._proven = not sealed
+    with pytest.raises(LinkError):
+        session.run()
+    assert session.supervisor._proven is sealed, "a session that could not be opened counts as well"

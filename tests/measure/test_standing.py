@@ -201,6 +201,7 @@ def test_a_datasheet_that_is_worse_today_ends_the_session_or_marks_its_values(
     with pytest.raises(BadDatasheetError, match=f"is {verdict} now: the signer is unknown; sequence") as refused:
         store.decide(standing, verdict=verdict)
     assert "Values recorded of it since 2027-01-15T08:00:00Z do not count" in refused.value.message
+    assert refused.value.hint == f"See: teds-provision verify {bytes(10).hex()}"
     assert standing.ended is refused.value
 
 

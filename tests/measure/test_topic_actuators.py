@@ -324,6 +324,8 @@ def test_what_was_applied_is_published_as_a_sample_that_the_datasheet_can_hold(m
     assert found[0].value.tolist() == [[pytest.approx(0.11 * 1861 / 4095, abs=1e-8)]], "not 0.05, which was asked"
     assert found[0].valid.tolist() == [[True]]
     assert not found[0].test_pattern
+    assert (found[0].tick.tolist(), found[0].tick.dtype) == ([0], "uint64"), "it has no time of the node"
+    assert 0 <= time.time() - float(found[0].time[0]) < 3600
 
 
 def test_of_set_points_that_wait_the_newest_is_applied() -> None:
