@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+
+from teds_provision.demo import page, story
+from teds_provision.errors import LinkError, TedsProvisionError
 
 from .shell import clean_environment
 
@@ -58,3 +66,203 @@ def test_an_ended_demo_takes_its_node_and_its_folder_away(tmp_path: Path, number
         process.kill()
     assert process.returncode == 130
     assert list(tmp_path.iterdir()) == []
+
+
+# -- the page's demo, in this process ----------------------------------------------------------------------------------
+
+REFUSED = b'{"error": {"code": "store", "message": "The disk is full.", "hint": "Free some space."}}\n'
+
+
+@pytest.mark.parametrize(
+    ("output", "message", "hint"),
+    [
+        (REFUSED, "The disk is full.", "Free some space."),
+        (b"Traceback", "The base station of the demo did not start.", ""),
+        (b"", "The base station of the demo did not start.", ""),
+    ],
+)
+def test_a_demo_that_cannot_begin_says_what_its_station_said(output: bytes, message: str, hint: str) -> None:
+    error = page._failure(output)
+    assert (error.message, error.hint) == (message, hint)
+
+
+@pytest.mark.parametrize(
+    ("output", "message", "hint"),
+    [
+        (REFUSED.decode(), "It failed: The disk is full.", "Free some space."),
+        ("Traceback\n", "It failed: Traceback", ""),
+        ("", "It failed: no answer", ""),
+    ],
+)
+def test_a_node_of_the_demo_that_does_not_start_says_why(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, output: str, message: str, hint: str
+) -> None:
+    error = story._failure("It failed", output)
+    assert (error.message, error.hint) == (message, hint)
+    demo: Any = SimpleNamespace(folder=tmp_path)
+    asked: list[list[str]] = []
+
+    def run(words: list[str], **_how: Any) -> Any:
+        asked.append(words[3:])
+        return SimpleNamespace(returncode=len(asked) - 1, stdout=output)
+
+    monkeypatch.setattr(story.subprocess, "run", run)
+    assert story.make_node(demo, "oven", "load-cell") == tmp_path / "oven-flash"
+    words = ["--json", "node", "create", str(tmp_path / "oven-flash"), "--profile", "load-cell"]
+    with pytest.raises(LinkError, match=message.replace("It failed", "The virtual node could not be made")):
+        story.make_node(demo, "oven", "load-cell")
+    assert asked == [words, words]
+
+
+@pytest.mark.parametrize(
+    ("line", "uuid"),
+    [
+        ('{"uuid": "0102030405060708090a", "ready": true}\n', bytes(range(1, 11))),
+        (REFUSED.decode(), None),
+        ("[1]\n", None),
+        ('{"uuid": 7}\n', None),
+        ("", None),
+    ],
+)
+def test_a_node_of_the_demo_is_ready_once_it_has_printed_its_uuid(line: str, uuid: bytes | None) -> None:
+    read, write = os.pipe()
+    os.write(write, line.encode())
+    os.close(write)
+    with open(read, encoding="utf-8") as output:
+        process: Any = SimpleNamespace(stdout=output)
+        if uuid is not None:
+            assert story._ready(process) == uuid
+        else:
+            with pytest.raises(LinkError, match="The virtual node did not start: "):
+                story._ready(process)
+
+
+class Child:
+    """Stands for a process that prints what it is given; ``ends``: it ends when it is told to."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, output: bytes, *, ends: bool = True, over: bool = False) -> None:
+        self.output, self.ends, self.over, self.course = output, ends, over, list[str]()
+        self.words, self.secret = list[str](), ""
+        patch.setattr(page.subprocess, "Popen", self.begin)
+
+    def begin(self, words: list[str], *, stdout: Any, pass_fds: tuple[int, ...], process_group: int, **_: Any) -> Child:
+        assert process_group == 0, "Ctrl-C reaches the demo alone"
+        self.words, self.secret = words[3:], os.read(pass_fds[0], 100).decode()
+        stdout.write(self.output)
+        stdout.flush()
+        return self
+
+    def poll(self) -> int | None:
+        return 0 if self.over else None
+
+    def terminate(self) -> None:
+        self.course.append("terminate")
+
+    def kill(self) -> None:
+        self.course.append("kill")
+
+    def wait(self, timeout: float | None = None) -> None:
+        self.course.append(f"wait {timeout}")
+        if timeout is not None and not self.ends:
+            raise subprocess.TimeoutExpired("ncap", timeout)
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_the_demos_station_gets_its_secret_by_a_descriptor_and_ends_with_the_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: bool
+) -> None:
+    child = Child(monkeypatch, b'{"ready": true}\nmore', ends=ends)
+    with page._daemon(tmp_path, "words", "--http", "127.0.0.1:1"):
+        assert child.course == []
+    *words, given, command, verb, option, where = child.words
+    assert words == ["--home", str(tmp_path), "--json", "--passphrase-fd"]
+    assert (given.isdigit(), command, verb, option, where) == (True, "ncap", "run", "--http", "127.0.0.1:1")
+    assert child.secret == "words\n"
+    assert child.course == ["terminate", "wait 15.0", *([] if ends else ["kill", "wait None"])]
+
+
+@pytest.mark.parametrize("case", ["refused", "ended", "late"])
+def test_a_station_of_the_demo_that_does_not_start_ends_the_demo_with_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    child = Child(monkeypatch, REFUSED if case == "refused" else b"", over=case == "ended")
+    now = [100.0]
+    sleep = lambda seconds: now.append(now[-1] + 40.0)  # noqa: E731
+    monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[-1], sleep=sleep))
+    with pytest.raises(TedsProvisionError) as failed, page._daemon(tmp_path, "words"):
+        pytest.fail("it did not start")
+    assert failed.value.message == (
+        "The disk is full." if case == "refused" else "The base station of the demo did not start."
+    )
+    assert (child.course, now[-1]) == (["terminate", "wait 15.0"], 180.0 if case == "late" else 100.0)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_demos_transducers_are_measured_as_one_group_once_they_are_authentic(
+    monkeypatch: pytest.MonkeyPatch, late: bool
+) -> None:
+    asked, now = list[Any](), [100.0]
+    verdicts = iter([None, {"verdict": "unsigned"}, *[{"verdict": "authentic"}] * 9])
+
+    class Api:
+        def request(self, method: str, path: str, body: dict[str, Any]) -> dict[str, str]:
+            asked.append((method, path, body))
+            return {"uuid": f"{len(asked):020x}"}
+
+        def node(self, uuid: str) -> dict[str, Any]:
+            return {"verdict": None if late else next(verdicts)}
+
+        def measure(self, **how: Any) -> None:
+            asked.append(how)
+
+    sleep = lambda seconds: now.append(now[-1] + 25.0)  # noqa: E731
+    monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[-1], sleep=sleep))
+    api: Any = Api()
+    if late:
+        with pytest.raises(LinkError, match="The virtual transducers were not ready within 60 s"):
+            page._measured(api)
+        return
+    page._measured(api)
+    uuids = [f"{number:020x}" for number in (1, 2, 3)]
+    *made, group, measured = asked
+    assert [(method, path, body["name"]) for method, path, body in made] == [
+        ("POST", "/virtual", name) for name in ("slew angle", "boom", "hand")
+    ]
+    assert group == ("POST", "/groups", {"name": "crane", "uuids": uuids})
+    assert (measured, now[-1]) == ({"group": "crane", "rate": 50.0}, 150.0)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("http", [None, "127.0.0.1:8351"])
+def test_the_demo_of_the_page_says_where_it_is_and_what_to_type_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, http: str | None, fails: bool
+) -> None:
+    said, ran, served = list[str](), list[Any](), list[Any]()
+
+    @contextmanager
+    def daemon(home: Path, secret: str, *options: str) -> Iterator[None]:
+        served.append((home, secret, options))
+        yield
+
+    def run(words: list[str], **_how: Any) -> Any:
+        ran.append(words[3:])
+        return SimpleNamespace(returncode=int(fails), stdout=REFUSED)
+
+    api = SimpleNamespace(login_url=lambda: "http://127.0.0.1:8351/login?once")
+    monkeypatch.setattr(page, "_daemon", daemon)
+    monkeypatch.setattr(page.client, "connect", lambda home: nullcontext(api))
+    monkeypatch.setattr(page, "_measured", lambda _api: None)
+    monkeypatch.setattr(page.subprocess, "run", run)
+    monkeypatch.setattr(page.tempfile, "mkdtemp", lambda prefix: str((tmp_path / prefix).mkdir() or tmp_path / prefix))
+    folder = tmp_path / "teds-provision-page-"
+    ending = pytest.raises(TedsProvisionError, match="The disk is full") if fails else nullcontext()
+    with ending, page.page_demo(said.append, http) as demo:
+        [(home, secret, options)] = served
+        assert (demo.home, home, demo.url) == (folder / "home", folder / "home", api.login_url())
+        assert (home / "store.sqlite3").exists()
+        assert (len(secret), options[0], options[2]) == (32, "--http", "--nfc")
+        assert options[1] == http if http else options[1].startswith("127.0.0.1:")
+        assert demo.tap == f"teds-provision node run {folder / 'oven'} --nfc {options[3]}"
+    profile = ["--profile", "temperature-sensor", "--name", "oven"]
+    assert ran == [["--json", "node", "create", str(folder / "oven"), *profile]]
+    assert (len(said), folder.exists()) == (2, False)

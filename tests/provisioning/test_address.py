@@ -11,6 +11,7 @@ from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.provisioning import address
 from teds_provision.provisioning.address import set_address, set_address_at
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from tests.bench import Board, MemoryLink, talk
@@ -119,3 +120,19 @@ def test_a_dry_run_meets_no_node(station: Station, board: Board, monkeypatch: py
     monkeypatch.setattr(address, "at_node", None)
     report = set_address_at(station, LinkSettings(), board.uuid.hex(), 0x22, SilentReporter(), dry_run=True)
     assert (report.uuid, report.changed) == (board.uuid, None)
+
+
+def test_a_session_that_is_lost_while_an_address_is_set_ends_with_its_cause(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cause = NodeSilentError("It is silent.")
+
+    def lose(*_: object, **__: object) -> bytes:
+        raise SessionLostError(cause)
+
+    monkeypatch.setattr(address, "open_session", lambda *_: None)
+    with talk(board) as node:
+        monkeypatch.setattr(node, "request", lose)
+        with pytest.raises(NodeSilentError) as lost:
+            set_address(station, node, 0x21)
+    assert lost.value is cause

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from teds_provision import teds
+from teds_provision.errors import NodeRefusedError
+from teds_provision.provisioning import board_type
 from teds_provision.provisioning.board_type import (
     WrongBoardError,
     differences,
@@ -221,3 +224,32 @@ def test_which_board_is_remembered_as_one_of_its_type(station: Station) -> None:
 def test_the_words_of_invalid_readings() -> None:
     assert invalid_readings(["1"]) == "The reading of channel 1 is invalid."
     assert invalid_readings(["1", "3"]) == "The readings of channels 1, 3 are invalid."
+
+
+@pytest.mark.parametrize(
+    ("case", "gives"),
+    [("valid", True), ("not valid", False), ("refused", False), ("refused at the sample", False), ("no form", False)],
+)
+def test_a_sensor_gives_a_value_if_its_own_says_so_and_is_let_go_in_any_case(
+    monkeypatch: pytest.MonkeyPatch, case: str, gives: bool
+) -> None:
+    course: list[str] = []
+
+    def request(_command: object, doing: str) -> bytes:
+        course.append(doing)
+        if case == "refused at the sample" and doing == "to sample":
+            raise NodeRefusedError("It is busy.", reason=17)
+        return b""
+
+    def operate(_node: object, number: int, digest: bytes, *, lease: int) -> None:
+        course.append(f"operate {number}")
+        if case == "refused":
+            raise NodeRefusedError("It is busy.", reason=17)
+
+    monkeypatch.setattr(board_type, "operate", operate)
+    monkeypatch.setattr(board_type.SampleReply, "decode", lambda *_: SimpleNamespace(valid=case == "valid"))
+    sample = None if case == "no form" else SimpleNamespace(octets=2)
+    channel: Any = SimpleNamespace(number=3, sample=sample)
+    assert board_type._gives_value(cast(Any, SimpleNamespace(request=request)), channel, b"digest") is gives
+    asked = {"refused": ["operate 3", "to let go"], "no form": []}
+    assert course == asked.get(case, ["operate 3", "to sample", "to let go"])

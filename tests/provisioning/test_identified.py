@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision.errors import NotAuthenticError, PolicyError, TedsProvisionError
+from teds_provision.errors import (
+    KeyringUnavailableError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+    TedsProvisionError,
+    WrongPassphraseError,
+)
 from teds_provision.links import LinkSettings, Notice
-from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.keys import fingerprint, node_key_message
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning import identify as step
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import (
@@ -194,3 +204,73 @@ def test_how_sure_a_station_is_of_a_newcomers_key(
     node = talk(board, MemoryLink(board, via=via, tapped=tapped))
     entry = new_whitelist_entry(station, node, identify(station, node))
     assert (entry.assurance, entry.fingerprint) == (assurance, fingerprint(board.key.point) if pinned else None)
+
+
+@pytest.mark.parametrize("error", [WrongPassphraseError("No."), KeyringUnavailableError("No."), StoreError("full")])
+def test_a_vault_that_stays_locked_leaves_the_pin_to_the_first_agreement(
+    station: Station, monkeypatch: pytest.MonkeyPatch, error: TedsProvisionError
+) -> None:
+    assert step._opened(station)
+
+    def locked(_own: Station) -> None:
+        raise error
+
+    monkeypatch.setattr(type(station), "unlock", locked)
+    if type(error) is StoreError:
+        with pytest.raises(StoreError):
+            step._opened(station)
+    else:
+        assert not step._opened(station)
+
+
+@pytest.mark.parametrize(
+    ("change", "recalled"),
+    [
+        ("nothing", True),
+        ("no key held", False),
+        ("no datasheet", False),
+        ("no reading", False),
+        ("read plainly", False),
+        ("factory state", False),
+        ("no node key", False),
+        ("no signature", False),
+        ("another node's signature", False),
+        ("it cannot prove it", False),
+    ],
+)
+def test_a_node_proves_the_key_of_its_last_session_unless_anything_of_it_is_not_as_it_was(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, change: str, recalled: bool
+) -> None:
+    provision(station, board)
+    row = station.datasheets.reading(board.uuid)
+    assert row is not None
+    assert row.in_session
+    forged = board.key.sign(node_key_message(bytes(10), board.key.point))
+    good = {"in_session": True, "node_key": row.node_key, "node_key_signature": row.node_key_signature}
+    changes: dict[str, Any] = {
+        "read plainly": SimpleNamespace(**good | {"in_session": False}),
+        "no node key": SimpleNamespace(**good | {"node_key": None}),
+        "no signature": SimpleNamespace(**good | {"node_key_signature": None}),
+        "another node's signature": SimpleNamespace(**good | {"node_key_signature": forged}),
+        "no reading": None,
+    }
+    if change in changes:
+        monkeypatch.setattr(type(station.datasheets), "reading", lambda *_: changes[change])
+    if change == "no key held":
+        monkeypatch.setattr(type(station.keys), "held", lambda *_: [])
+    if change == "no datasheet":
+        monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_: None)
+    proved: list[bytes] = []
+
+    def prove(_node: Conversation, point: bytes) -> None:
+        proved.append(point)
+        if change == "it cannot prove it":
+            raise NotAuthenticError("It cannot.")
+
+    monkeypatch.setattr(step, "prove", prove)
+    with talk(board) as node:
+        if change == "factory state":
+            node.identity = replace(node.identity, state=NodeState.FACTORY)
+        who = step._recalled(station, node)
+    assert (who is not None and who.recalled and who.point == board.key.point) is recalled
+    assert proved == ([board.key.point] if recalled or change == "it cannot prove it" else [])

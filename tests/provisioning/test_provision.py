@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -20,9 +22,12 @@ from teds_provision.errors import (
 )
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, TedsFunction
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning import provision as provision_module
 from teds_provision.provisioning.agree import require_session
-from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.board_type import HardwareCheck, WrongBoardError
+from teds_provision.provisioning.build import BuildOrder, PreparedOrder
 from teds_provision.provisioning.calibration_guard import merged
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.identify import IdentifiedNode
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
@@ -30,7 +35,8 @@ from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.image import SECURITY
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile import load_profile
 from tests.answers import Answers
 from tests.bench import Board, MemoryLink, copied_station, make_station, talk
 
@@ -338,3 +344,104 @@ def test_what_is_reported_of_several_channels_is_one_sentence() -> None:
     messages = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
     assert merged(messages) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
     assert merged(messages[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)
+
+
+@dataclass
+class OneUnit:
+    """A line that allots one unit, and what it is told of it."""
+
+    prepared: PreparedOrder
+    course: list[Any] = field(default_factory=list)
+
+    def order(self, who: IdentifiedNode) -> PreparedOrder:
+        self.course.append("order")
+        return self.prepared
+
+    def allot_unit(self, _node: Any, who: IdentifiedNode, prepared: PreparedOrder, taken: None) -> Any:
+        assert (prepared, taken) == (self.prepared, None)
+        self.course.append("allot")
+        return self
+
+    def ended(self, _node: Any, done: ProvisionResult) -> None:
+        self.course.append(done)
+
+    def failed(self, _node: Any, who: IdentifiedNode, steps: list[Any], step: str, error: TedsProvisionError) -> None:
+        self.course.append((who.uuid, [one.name for one in steps], step, error))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "sealed", "profile", "measures", "found", "failure"),
+    [
+        ("authentic", True, True, True, ["done", "done", "done"], None),
+        ("authentic", True, True, False, ["done", "done", "skipped"], None),
+        ("authentic", False, True, True, ["done", "done", "skipped"], None),
+        ("not authentic", True, True, True, ["done", "failed", "skipped"], None),
+        ("authentic", True, False, True, ["done", "done", "done"], None),
+        ("authentic", True, True, True, ["identify"], "another type"),
+        ("authentic", True, True, True, ["identify", "verify"], "lost"),
+    ],
+)
+def test_a_board_that_is_only_verified_is_judged_checked_and_reported_to_its_line(
+    station: Station,
+    board: Board,
+    monkeypatch: pytest.MonkeyPatch,
+    verdict: str,
+    sealed: bool,
+    profile: bool,
+    measures: bool,
+    found: list[str],
+    failure: str | None,
+) -> None:
+    gripper, image = load_profile("gripper"), Image(board.uuid, {})
+    line = OneUnit(PreparedOrder(BuildOrder(), gripper if profile else None))
+    cause = NodeSilentError("It is silent.")
+    verified: Any = SimpleNamespace(verdict=verdict)
+    borne = HardwareCheck({1: True} if measures else {}, ({"channel": 1},), ("It is low.",))
+
+    def firmware(_node: Any) -> str:
+        if failure == "lost":
+            raise SessionLostError(cause)
+        return "firmware"
+
+    module = provision_module
+    monkeypatch.setattr(module, "verify_at_node", lambda *_: SimpleNamespace(verified=verified, image=image))
+    monkeypatch.setattr(module, "differences", lambda *_: ("in N",) if failure == "another type" else ())
+    monkeypatch.setattr(module, "read_firmware", firmware)
+    monkeypatch.setattr(module, "check_hardware", lambda _node, _image: borne)
+    locked: list[Any] = []
+
+    @contextmanager
+    def lock(_own: Station, uuid: bytes, what: str = "") -> Iterator[Any]:
+        locked.append((uuid, what))
+        yield
+
+    monkeypatch.setattr(type(station), "node_lock", lock)
+    station.released = lambda uuid, what: lock(station, uuid, what)
+    with talk(board) as node:
+        monkeypatch.setattr(type(node), "sealed", property(lambda _node: sealed))
+        if failure is not None:
+            error = WrongBoardError if failure == "another type" else SessionLostError
+            with pytest.raises(error):
+                module.verify_only(station, node, cast(Any, line), SilentReporter())
+        else:
+            done = module.verify_only(station, node, cast(Any, line), SilentReporter())
+    assert locked == [(board.uuid, ""), (board.uuid, "provision")]
+    *before, last = line.course
+    assert before == ["order", "allot"]
+    if failure is None:
+        hardware = borne if verdict == "authentic" and sealed else HardwareCheck({})
+        assert [(step.name, step.result) for step in done.steps] == list(
+            zip(["identify", "verify", "check"], found, strict=True)
+        )
+        assert done.steps[0].detail == f"{board.uuid.hex()}, key {done.who.fingerprint[:16]}"
+        assert (last, done.image, done.verified, done.firmware) == (done, image, verified, "firmware")
+        assert (done.warnings, done.samples) == (hardware.warnings, hardware.samples)
+        return
+    step = "verify" if failure == "another type" else "check"
+    assert last[:3] == (board.uuid, found, step)
+    assert last[3] is cause if failure == "lost" else isinstance(last[3], WrongBoardError)
+    logged = [entry for entry in station.audit_log.entries() if entry.act == "provision"]
+    if failure == "another type":
+        [entry] = logged
+        assert (entry.uuid, entry.outcome, entry.detail["step"]) == (board.uuid, "wrong-board", "verify")
+        assert entry.detail["why"] == last[3].message

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from teds_provision.provisioning import build as build_module
 from teds_provision.provisioning.agree import reset_node
-from teds_provision.provisioning.build import BuildOrder, UnrequestedChangeError, build
+from teds_provision.provisioning.build import (
+    BuildOrder,
+    PreparedOrder,
+    UnrequestedChangeError,
+    build,
+    content_digests,
+    profile_files_digest,
+)
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
+from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile import load_profile
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk
 from tests.pace import until
@@ -88,3 +100,38 @@ def test_a_change_of_a_profile_that_another_one_extends_reaches_a_process_that_r
     for unit in ("degF", "K"):
         show_in(unit)
         until(lambda unit=unit: shown_units(station, uuid) == {1: unit})
+
+
+def test_the_files_of_a_profile_have_a_digest_as_long_as_they_are_those_of_the_datasheet(
+    station: Station, board: Board, here: Path
+) -> None:
+    provisioned(station, board, BuildOrder(profile="own.toml"))
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    digest = profile_files_digest(station, record)
+    assert digest is not None
+    assert len(digest) == 64
+    for unknown in (None, replace(record, profile=None), replace(record, profile_digest=None)):
+        assert profile_files_digest(station, unknown) is None
+    assert profile_files_digest(station, replace(record, profile_digest="ab" * 32)) is None
+    file = here / "own.toml"
+    kept = file.read_text()
+    file.write_text(kept.replace("title", "titel", 1))
+    assert profile_files_digest(station, record) is None, "it is being edited"
+    file.unlink()
+    assert profile_files_digest(station, record) is None
+    file.write_text(kept)
+    assert profile_files_digest(station, record) == digest
+
+
+def test_a_damaged_security_teds_has_no_sequence() -> None:
+    assert build_module._sequence(None) == -1
+    assert build_module._sequence(Image(bytes(10), {})) == -1
+    assert build_module._sequence(Image(bytes(10), {SECURITY: frame(b"\xff\xff")})) == -1
+
+
+def test_without_a_profile_there_is_no_content_and_without_calibrations_only_that_of_the_profile() -> None:
+    gripper = load_profile("gripper")
+    assert content_digests(PreparedOrder(BuildOrder())) == ("", "")
+    of_profile, none = content_digests(PreparedOrder(BuildOrder(), gripper))
+    assert (len(of_profile), none) == (64, "")

@@ -23,6 +23,7 @@ from teds_provision.errors import (
     VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings
+from teds_provision.provisioning import batch_sheet
 from teds_provision.provisioning.batch import BatchRun, ProvisionRequest
 from teds_provision.provisioning.batch_sheet import (
     BatchSheet,
@@ -37,12 +38,13 @@ from teds_provision.provisioning.batch_sheet import (
     worse,
     write_report,
 )
-from teds_provision.provisioning.build import BuildOrder, check_name, for_several, named_for, prepare
+from teds_provision.provisioning.build import BuildOrder, PreparedOrder, check_name, for_several, named_for, prepare
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord, WhitelistEntry
 from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
 from tests.bench import Board, contact
 from tests.pace import PATIENCE
 
@@ -764,3 +766,25 @@ def test_a_name_fits_into_its_teds_and_is_shown_whole(name: str, message: str) -
     with pytest.raises((UsageError, BadDataError)) as refused:
         check_name(name)
     assert refused.value.message == message
+
+
+def test_warnings_that_rows_share_are_one_with_all_their_numbers(station: Station, tmp_path: Path) -> None:
+    cell = load_profile("load-cell")
+    prepared = [
+        PreparedOrder(BuildOrder(), cell if number > 2 else None, warnings=warnings)
+        for number, warnings in enumerate((("old",), (), ("old", "late"), ("old",)), 1)
+    ]
+    rows = tuple(SheetRow(number, number + 1, None, None, one, "") for number, one in enumerate(prepared, 1))
+    lacks = "the type requires a calibration, but the sheet gives none."
+    assert BatchSheet(tmp_path, rows).warnings == ("Rows 1, 3, 4: old", "Row 3: late", f"Rows 3, 4: {lacks}")
+
+
+def test_a_sheet_has_at_most_ten_thousand_rows(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert batch_sheet.MAX_ROWS == 10_000
+    monkeypatch.setattr(batch_sheet, "MAX_ROWS", 3)
+    lines = "".join(f",b{number}\n" for number in range(3))
+    assert len(read(station, tmp_path, f"uuid,name\n{lines}\n").rows) == 3
+    with pytest.raises(BadDataError, match=r"boards\.csv:5: there are more than 3 rows\."):
+        read(station, tmp_path, f"uuid,name\n{lines},b\n,c\n,d\n")
