@@ -291,3 +291,18 @@ def test_a_request_after_128_10_whose_reply_waits_is_not_answered_at_the_old_add
     assert bus.says() == []
     bus.hears("070a" + IDENTIFY, to=33)
     assert bus.says()[0][0].startswith("101b0a")
+
+
+@pytest.mark.parametrize("before", [None, False, True])
+@pytest.mark.parametrize("fd", [False, True])
+def test_a_refusal_in_place_of_a_flow_control_has_the_form_of_its_first_frame(
+    bus: Bus, fd: bool, before: bool | None
+) -> None:
+    if before is not None:
+        bus.hears("0708" + IDENTIFY, fd=before)
+        assert bus.says()[0][1] == before
+        bus.now += 2.0
+        bus.says()
+    bus.hears("1fff770000010300", fd=fd)
+    ((frame, form),) = bus.says()
+    assert (frame[:12], form) == ("05770000010a", fd)

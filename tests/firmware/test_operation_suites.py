@@ -288,6 +288,10 @@ def test_an_actuator_is_served_alike_in_the_first_place_of_the_table_and_in_the_
     if end != "by hand":
         stopped = ChannelState.STOPPED if end in ("dead-man", "trigger") else 0
         assert bench.operation().channels[number] == (ChannelState.ACTUATOR | ChannelState.SAFE | stopped, 0)
+        if end != "power":
+            bench.operate(number)
+            claimed = ChannelState.ACTUATOR | ChannelState.CLAIMED_HERE | ChannelState.SAFE
+            assert bench.operation().channels[number] == (claimed, 0xF1), "stopped is since its last Operate"
 
 
 def test_two_event_sensors_have_rings_of_their_own() -> None:

@@ -831,6 +831,56 @@ static void a_station_without_a_line_is_refused(void)
     memory_free(board);
 }
 
+/* The same, in the form in which it asked. */
+static void a_station_without_a_line_is_refused_in_its_form(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    has_session(board, 0, 0xF1);
+    has_session(board, 1, 0xF2);
+    CHECK(is_answered(board, 0xF1) && is_answered(board, 0xF2), "their lines");
+    in(board, TO_NODE + 2, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "a long question comes in");
+    in(board, TO_NODE + 3, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "an answer begins");
+    for (int form = 0; form < 4; form++) {
+        bool fd = form % 2 == 0;
+        const bool asked = form % 2 != 0;
+        in(board, TO_NODE + 4, form < 2 ? "\x07\x2c\x00\x00\x80\x07\x00\x00" : "\x10\x64\x2c\x00\x00\x01\x03\x00", 8, asked);
+        CHECK(memory_can_tx(board, &identifier, data, &fd) == 8 && data[5] == 17 && fd == asked, "17 in form %d", form);
+    }
+    memory_free(board);
+}
+
+/* A stranger's long request that gives way before its flow control has left gets 17 alone; and who was refused once does
+ * not keep the place from the other for ever. */
+static void a_long_request_that_gives_way_is_not_asked_on(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    has_session(board, 0, 0xF3);
+    asks_for_much(board);
+    in(board, TO_NODE + 2, "\x10\x0c\x7a\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF100u | OWN) &&
+              memcmp(data, "\x05\x05\x00\x00\x01\x11", 6) == 0, "17, and no flow control");
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF300u | OWN) && data[0] == 0x30, "flow control");
+    CHECK(silent(board), "nothing else");
+    memory_free(board);
+    board = fresh();
+    asks_for_much(board);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "flow control");
+    in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[5] == 17, "another waits");
+    now += 1001 * MS;
+    for (unsigned i = 0; i < 3; i++) {
+        asks_for_much(board);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "long after, nobody waits: it may begin again");
+    }
+    memory_free(board);
+}
+
 /* A long request as a whole ends in bounded time, whoever sends it, and however: by frames that come just in time, or by
  * beginning again and again. */
 static void one_station_does_not_hold_the_place_of_long_requests(void)
@@ -1195,6 +1245,8 @@ int main(void)
     the_end_of_a_session_is_due();
     what_waits_for_its_station_is_wiped_after_a_minute();
     a_station_without_a_line_is_refused();
+    a_station_without_a_line_is_refused_in_its_form();
+    a_long_request_that_gives_way_is_not_asked_on();
     one_station_does_not_hold_the_place_of_long_requests();
     a_reply_that_is_another_link_s_is_nobodys();
     an_answer_to_everyone_is_of_one_moment();
