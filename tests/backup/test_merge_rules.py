@@ -305,6 +305,14 @@ def test_what_was_given_again_after_its_end_comes_back(two: Two) -> None:
     assert dict(two.merged(OTHER).back) == back
 
 
+@pytest.mark.parametrize("how", [OLDER, OTHER, NEWER])
+def test_trust_that_was_only_begun_here_is_not_taken_for_ended(two: Two, how: Relation) -> None:
+    two.live.audit("trust", None, "trusted", name="north", role="ca", key=KEY)
+    two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY2)
+    two.copy.policy.restore_trust(TRUSTED)
+    assert dict(two.merged(how).back) == {"trust in ca north": 1}
+
+
 def test_trust_that_a_newer_copy_ended_ends_here(two: Two) -> None:
     for how, names in ((OTHER, ["north"]), (NEWER, [])):
         two.live.policy.restore_trust(TRUSTED)

@@ -17,7 +17,7 @@ from teds_provision.teds.dcc.items import UnclearItemError, items_of
 from teds_provision.teds.dcc.read import DigitalCertificate, ResultTable, read_certificate
 from teds_provision.teds.dcc.shown import ShownCertificate, points_of
 from teds_provision.teds.dcc.si_units import parse_si_unit, write_si_unit
-from teds_provision.teds.dcc.write import Laboratory, read_laboratory, write_certificate
+from teds_provision.teds.dcc.write import Laboratory, QuantityCondition, read_laboratory, write_certificate
 from teds_provision.teds.profile import Profile, load_profile
 from teds_provision.teds.units import parse_unit
 
@@ -682,6 +682,27 @@ def test_a_certificate_is_of_the_newest_day_of_its_points_and_of_today_without_o
     assert "<dcc:release>v0</dcc:release>" in text
     plain = read_certificate(written("0,0\n1,1\n", Laboratory()).encode(), "c")
     assert (plain.calibrated, plain.number) == (date(2026, 11, 26), "teds-provision-2026-11-26-e3b0c44298fc1c14")
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "number", "written_unit"),
+    [
+        (23.5, "degC", 23.5, r"\degreecelsius"),
+        (68.0, "degF", 293.15, r"\kelvin"),
+        (1013.0, "hPa", 1013.0, r"\hecto\pascal"),
+        (45.0, "%", 0.45, r"\one"),
+    ],
+)
+def test_a_condition_is_written_in_a_unit_of_the_d_si(
+    value: float, unit: str, number: float, written_unit: str
+) -> None:
+    condition = QuantityCondition("around", value, parse_unit(unit))
+    text = written("0,0\n1,1\n", replace(Laboratory(), conditions=(condition,)))
+    inside = text[text.index("<dcc:influenceCondition>") : text.index("</dcc:influenceCondition>")]
+    assert "<dcc:content>around</dcc:content>" in inside
+    (stated,) = re.findall(r"<si:value>(.*?)</si:value>", inside)
+    assert float(stated) == pytest.approx(number)
+    assert re.findall(r"<si:unit>(.*?)</si:unit>", inside) == [written_unit]
 
 
 def test_what_the_laboratory_states_of_itself_is_in_its_contact() -> None:

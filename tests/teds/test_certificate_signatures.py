@@ -62,7 +62,11 @@ def test_a_signature_cannot_be_left_out_if_one_is_required() -> None:
 
 def test_a_laboratory_below_a_trusted_ca_is_trusted() -> None:
     lab, ca = signer_under_ca()
-    assert read(lab.sign(ANGLE), ca).signature == "good"
+    good = read(lab.sign(ANGLE), ca)
+    assert good.signature == "good"
+    assert good.unchecked == (
+        "Not checked: revocation of the signer's certificate, time stamps, signature policies (XAdES-T and above).",
+    ), "nothing has expired"
     with pytest.raises(NotAuthenticError, match="CN=Lab under a CA, which is not trusted"):
         read(lab.sign(ANGLE), signer().certificate)
 
@@ -79,6 +83,10 @@ def test_an_expired_signers_certificate_counts_at_the_time_of_signing_and_is_sta
     gone = signer("Expired long ago", (-900, -500))
     with pytest.raises(NotAuthenticError, match="not valid any more"):
         read(gone.sign(ANGLE), gone.certificate)
+    for xades in (True, False):  # of a signer whom nobody vouches for it does not matter since when
+        unknown = read(gone.sign(ANGLE, xades=xades))
+        assert (unknown.signature, len(unknown.unchecked)) == ("not checked", 2)
+        assert unknown.unchecked[0].startswith("The signer is not known")
 
 
 def test_a_signature_wrapped_into_another_certificate_covers_nothing() -> None:

@@ -188,6 +188,20 @@ def test_times_that_cannot_be_expressed(value: object) -> None:
         teds.compose(5, {"LstCalDt": value})
 
 
+def test_no_time_at_all_has_no_sign() -> None:
+    octets = teds.compose(5, {"LstCalDt": 0})
+    assert bytes.fromhex("0a08 00000000 00000000") in octets
+    assert teds.decode(octets).get("LstCalDt") == teds.TimeInstance(0, 0, False)
+
+
+def test_field_3_of_a_security_teds_is_no_tedsid() -> None:
+    """There alone type 3 stands behind the TEDSID too (security-teds.md): the encryption."""
+    octets = teds.compose(128, {"UsedSecScheme": 4, "3": b"\1"})
+    assert teds.decode(octets).get("UsedEncAlg") == 1
+    with pytest.raises(BadDataError, match="has no field '3'"):
+        teds.compose(3, {**KELVIN, "3": b"\1"})
+
+
 def test_negative_times() -> None:
     octets = teds.compose(5, {"LstCalDt": -1.5})
     assert teds.decode(octets).get("LstCalDt") == teds.TimeInstance(1, 500_000_000, True)

@@ -140,6 +140,23 @@ def test_an_expression_that_means_nothing_is_refused_by_name(text: str, words: s
     assert words in caught.value.message
 
 
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("angle >= 360 N", "rad"),
+        ("force >= 3 m", "N"),
+        ("temperature >= 3 m", "K"),
+        ("angle >= 1 deg, rate >= 5 deg", "1/s"),
+        ("angle >= 1 deg, uncertainty <= 1 N", "rad"),
+        ("rate >= 5 m", "1/s"),
+    ],
+)
+def test_a_unit_of_another_kind_is_answered_with_one_that_fits(text: str, unit: str) -> None:
+    with pytest.raises(BadDataError) as caught:
+        parse_fits(text)
+    assert caught.value.hint == f"Write it in {unit}, or in another unit of the same kind."
+
+
 @given(st.text(max_size=80) | st.text("anglerate><= 0123456789.,dNHzk%-", max_size=60))
 def test_no_expression_raises_anything_else(text: str) -> None:
     try:

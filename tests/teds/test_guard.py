@@ -335,6 +335,19 @@ def test_a_fit_whose_residual_exceeds_the_uncertainty_is_refused(tactile: Profil
     assert codes(check_calibration(blocks)) == {"residual"}
 
 
+def test_a_change_in_degrees_celsius_is_a_difference() -> None:
+    """A fall by 150 degrees is no fall to 150 degrees below absolute zero."""
+    profile = load_profile("temperature-sensor", [shipped_profiles()])
+    ends = "raw,value [degC]\n0,{}\n21120,{}\n"
+    rising, falling = (
+        profile.build(UUID, calibration=read_calibrations(ends.format(*pair), "x.csv", profile)).blocks
+        for pair in ((-40, 120), (110, -40))
+    )
+    assert text(check_calibration(falling, rising), "reversed") == (
+        "the result falls by 150 °C from raw 0 to raw 21120; its type says that it must be increasing"
+    )
+
+
 def test_the_uncertainty_of_a_calibration_in_degrees_celsius_is_a_difference() -> None:
     profile = load_profile("temperature-sensor", [shipped_profiles()])
     for stated, found in ((0.4, set()), (0.6, {"residual"})):

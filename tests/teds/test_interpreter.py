@@ -294,6 +294,28 @@ def test_an_angle_finds_its_way_back_across_the_wrap(zero: float, angle: float) 
     assert abs(off - 360 * round(off / 360)) < 360 / 4096
 
 
+@pytest.mark.parametrize(
+    ("angle", "raw"),
+    [
+        (10.0, 0),
+        (350.0, 4095),
+        (180.05, 2048),
+        (5.0, 0),
+        (355.0, 4095),
+        (0.1, 0),
+        (359.9, 4095),
+        (370.0, 0),
+        (-10.0, 4095),
+    ],
+)
+def test_an_angle_that_a_sensor_does_not_reach_is_nearest_to_one_of_its_ends(angle: float, raw: int) -> None:
+    """Its raw values cover 10 to 350 degrees of the turn; between 350 and 10 the nearer end counts."""
+    line = replace(fit([(0, 10.0), (4095, 350.0)], "linear", channel=1), unit=parse_unit("degree"))
+    sheet = sheet_of("magnetic-angular-position-sensor", {1: line})
+    sheet = changed(sheet, low=0.0, high=2 * math.pi, sample=SampleForm(DataModel.UNSIGNED, 2, 12))
+    assert ChannelInterpreter(sheet, 1).encode(angle) == raw.to_bytes(2, "big")
+
+
 def test_a_turn_is_two_pi_to_a_hundred_thousandth_and_of_sensors_of_angles_alone() -> None:
     known = turned(90.0).channel(1)
     assert known is not None

@@ -163,6 +163,16 @@ def test_a_symbol_is_only_suggested_with_a_power_that_a_teds_holds(monkeypatch: 
     u.parse_unit.cache_clear()
 
 
+@pytest.mark.parametrize("text", ["metre/fortnight", "newton of", "hertz + newton", "metre**0.3"])
+def test_what_would_be_no_unit_in_symbols_either_is_not_suggested(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(u, "_registry", lambda: None)
+    u.parse_unit.cache_clear()
+    with pytest.raises(BadDataError) as refused:
+        u.parse_unit(text)
+    assert not re.search(r'Did you mean "(m/fortnight|N of|Hz \+ N|m\*\*0\.3)"', refused.value.hint)
+    u.parse_unit.cache_clear()
+
+
 def test_without_the_package_pint_its_units_are_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pint", None)
     assert u._registry.__wrapped__() is None, "past its cache: to load pint again would take a second"

@@ -214,6 +214,21 @@ def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
     wait_until(lambda: not (home / agent.SOCKET).exists())
 
 
+def test_one_that_ends_leaves_the_socket_of_another_that_took_its_place(tmp_path: Path) -> None:
+    """The first was cut off from its socket; at its end it must not take away that of the second."""
+    agent.start(tmp_path, "file", b"first", 60)
+    first = process_of(tmp_path)
+    (tmp_path / agent.SOCKET).unlink()
+    agent.start(tmp_path, "file", b"second", 60)
+    try:
+        os.kill(first, signal.SIGTERM)
+        wait_until(lambda: not lives(first))
+        assert agent.held(tmp_path, "file") == b"second"
+    finally:
+        assert agent.lock(tmp_path)
+    assert not (tmp_path / agent.SOCKET).exists()
+
+
 def test_what_changes_or_takes_the_keys_along_asks_all_the_same(home: Path, tmp_path: Path) -> None:
     assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
     assert run(home, "vault", "passphrase").code == 7

@@ -87,6 +87,8 @@ PBES2, PBKDF2 = "06092a864886f70d01050d", "06092a864886f70d01050c"
         ("31 0a 0402 abcd 0202 0800", False),  # no SEQUENCE
         ("30 0a 0502 abcd 0202 0800", False),  # the salt is no OCTET STRING
         ("30 0a 0480 abcd 0202 0800", False),  # its length is not one octet
+        ("30 81 86 0480" + "ab" * 128 + "0202 0800", False),  # nor is this one
+        ("30 81 85 047f" + "ab" * 127 + "0202 0800", True),
         ("30 0a 0402 abcd 0302 0800", False),  # the number is no INTEGER
         ("30 0a 0402 abcd", False),  # cut off
         ("30", False),

@@ -295,6 +295,9 @@ def test_the_public_point_is_read_wherever_a_token_shows_it(monkeypatch):
         (Held({**safe, Attribute.EC_POINT: der}), (Held(),)),
     ):
         assert found(private, *public).point == POINT
+    like_der = SoftwareKey(37).point
+    assert like_der[:2] == b"\x04\x41", "a bare point whose first octets are those of the OCTET STRING"
+    assert found(Held(safe), Held({Attribute.EC_POINT: like_der})).point == like_der
     with pytest.raises(VaultError) as refused:
         found(Held(safe), Held())
     assert refused.value.message == "The token 't' shows no public key beside 'station'."
