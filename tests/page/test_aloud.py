@@ -16,7 +16,7 @@ import pytest
 
 from .stage import ARM, HAND, NOW
 from .stage import FOLDER as PAGE
-from .test_forms import BOARDS, DRY, IMAGE, PLAN, entries, give
+from .test_forms import BOARDS, DRY, IMAGE, PLAN, entries, give, texts
 from .test_overview import SAYS, THIRD, listing
 from .test_panels import ANGLE, PAIR, RUNNING, measured
 from .test_parts import CHECKS, PROVISION, READ, READY, TEDS, VIRTUAL, judged
@@ -275,7 +275,9 @@ def look_at(stage: Stage, show: Callable[[Stage], None]) -> Seen:
     stage.pass_time(3000)
     stage.pass_time(40_000)
     after = stage.run(LOOK)
-    return Seen(aloud, classes, [*stage.sent, *stage.wrong] or (after if after != before else None))
+    wrong = [*stage.sent, *stage.wrong, *stage.run("return [...document.getElementById('toasts').children]"
+                                                   ".map((one) => one.textContent)")]  # fmt: skip
+    return Seen(aloud, classes, wrong or (after if after != before else None))
 
 
 @pytest.fixture(scope="module")
@@ -296,6 +298,27 @@ def test_a_view_that_was_left_asks_nothing_and_changes_nothing(seen: dict[str, S
     assert {name: view.after for name, view in seen.items() if view.after is not None} == {}
 
 
+AT_ONCE = {
+    "station.stationView(main)": ["Values are not recorded or published.", "No channels are published yet."],
+    "virtual.virtualView(main)": ["No virtual transducers yet."],
+    "measure.measureView(main)": ["No groups yet.", "No measurement is running."],
+    "nodes.nodesView(main, [])": ["Loading \u2026"],
+    "new update.UpdatePanel(main, () => [], () => 0)": ["No boards are selected."],
+}
+
+
+@pytest.mark.parametrize("what", AT_ONCE)
+def test_a_view_is_there_before_the_station_has_answered(stage: Stage, what: str) -> None:
+    stage.answers(**{f"GET {name}": "held" for name in ("status", "names", "profiles", "virtual", "updates", "jobs")})
+    try:
+        stage.run(f"state.loaded = false; const main = document.getElementById('main'); show({what})")
+        found = texts(stage, "main .empty .lead, main p.empty, main .stack > p:first-child")
+        assert found[: len(AT_ONCE[what])] == AT_ONCE[what]
+    finally:  # else the next test's questions wait for these
+        stage.run("window.ends.splice(0).forEach((one) => one.end()); window.held.splice(0).forEach((go) => go({}))")
+        stage.pass_time(20)
+
+
 # what an element is, for tests and scripts; it has no look of its own
 BARE = {"plain", "busy-line", "brought", "arrow", "rate-hint", "check", "actuator-state", "fresh", "feed-state",
         "feed-channels"}  # fmt: skip
@@ -313,3 +336,18 @@ def test_each_class_of_an_element_is_one_of_the_style_sheets_and_each_of_these_i
     }
     made = {f"line-{number}" for number in range(1, 9)} | {"view-nodes", "u-select", "u-cursor-x"}
     assert styled - words == made
+
+
+def test_each_icon_that_a_script_names_is_drawn() -> None:
+    """An unknown one is drawn as a question mark."""
+    scripts = {file.name: file.read_text(encoding="utf-8") for file in PAGE.glob("js/**/*.js")}
+    drawn = re.search(r"const PATHS = \{(.*?)\n\};", scripts["dom.js"], re.DOTALL)
+    assert drawn is not None
+    known = set(re.findall(r"^  (\w+): \"M", drawn[1], re.MULTILINE))
+    patterns = (
+        r"icon\(\"(\w*)\"\)", r"chip\(\"\w*\", \"(\w*)\"", r"button\([^{}]*\{[^{}]*\}, \"(\w*)\"\)",
+        r"\[\"(?:good|warn|bad|plain|busy)\", \"(\w*)\"(?:, \"[^\"]*\")?\]",
+    )  # fmt: skip
+    named = {(name, one) for name, text in scripts.items() for pattern in patterns for one in re.findall(pattern, text)}
+    assert len(named) > 50
+    assert {one for one in named if one[1] not in known} == set()

@@ -66,14 +66,15 @@ def test_each_curve_has_a_colour_and_the_ninth_a_dash_and_frames_share_the_heigh
       const swatches = [...document.querySelectorAll(".swatch")];
       return [lines.map((one) => known.indexOf(one.stroke()) + 1), lines.map((one) => one.dash ?? []),
         swatches.map((one) => one.classList[1]), swatches.map((one) => one.firstChild.getAttribute("stroke-dasharray")),
+        lines.every((one) => one.points.show(window.chart(), 1) === false && one.width === 1),
         swatches.every((one) => one.firstChild.getAttribute("d") && one.getAttribute("aria-hidden") === "true")];
     """
-    colours, dashes, classes, drawn_dashes, whole = stage.run(style)
+    colours, dashes, classes, drawn_dashes, bare, whole = stage.run(style)
     assert colours == [1, 2, 3, 4, 5, 6, 7, 8, 1]
     assert dashes == [[]] * 8 + [[7, 3]]
     assert classes == [f"line-{number}" for number in (1, 2, 3, 4, 5, 6, 7, 8, 1)]
     assert drawn_dashes == [""] * 8 + ["7 3"]
-    assert whole
+    assert (bare, whole) == (True, True)
     for units, height in ((["mm"], 320), (["mm", "N"], 220), (["mm", "N", "V"], 160)):
         stage.run("window.plot.show(words)", *channels(*units))
         assert stage.run("return window.plot.frames.map((one) => one.chart.height)") == [height] * len(units)
@@ -231,6 +232,13 @@ def test_it_draws_at_most_twenty_times_a_second_and_less_often_if_that_takes_lon
         ("painted", 1342 + 17 + 70, [4, 4, 1542]), ("painted", 9000, [4, 4, 1542]), ("draw", 1541, [4, 4, 1542]),
     ):  # fmt: skip
         assert stage.run(draw, what, time) == pytest.approx(wanted), (what, time)
+    hidden = "Object.defineProperty(document, 'hidden', { configurable: true, get: () => true }); window.plot.ask();"
+    try:
+        stage.sent  # noqa: B018
+        assert stage.run(hidden + draw, "draw", 99_000)[0] == 4, "nobody sees it"
+        assert stage.sent == []
+    finally:
+        stage.run("delete document.hidden")
 
 
 def test_a_curve_of_a_calibration_has_its_units_and_dots_while_there_are_few(stage: Stage) -> None:

@@ -396,8 +396,18 @@ def test_how_an_update_goes_is_told_board_by_board(firmware: Stage) -> None:
         "node dddddddd unknown → 1.4.0 waiting",
     ]
     assert firmware.page.get_by_role("progressbar", name="Upload to third").get_attribute("value") == "50"
+    chips = "return [...document.querySelectorAll('.lines .chip')].map((one) => one.className)"
+    assert firmware.run(chips) == ["chip good", "chip bad", "chip busy", "chip plain"]
+    firmware.answers(**{"DELETE updates/u1": {"refused": 409, "message": "It is over.", "hint": "Look."}})
     press(firmware, "Begin no further board")
-    assert {"method": "DELETE", "path": "updates/u1", "body": {}} in firmware.sent
+    assert texts(firmware, "[aria-label='How the update goes'] .trouble") == ["It is over. Look."]
+    firmware.answers(**{"DELETE updates/u1": {}})
+    firmware.sent  # noqa: B018
+    press(firmware, "Begin no further board")
+    firmware.pass_time(20)
+    asked = [(entry["method"], entry["path"]) for entry in firmware.sent]
+    assert asked == [("DELETE", "updates/u1"), ("GET", "updates")]
+    assert texts(firmware, "[aria-label='How the update goes'] .trouble") == []
     words = {"restart": "restarting", "prove": "proving itself", "revert": "going back", "else": "looking"}
     for step, shown in words.items():
         boards[2]["step"] = step

@@ -104,12 +104,15 @@ def test_what_is_open_beside_the_list_gives_way_to_what_is_chosen(stage: Stage) 
     assert (texts(stage, heads), stage.run(look)) == (["hand"], [False, 1]), "the first one, if none is chosen"
     for rest, head, tabs in (
         (["next", "provision"], "Provision the next tapped node", 0), (["update"], "Firmware update", 0),
-        ([HAND, "history"], "slew", 1), (["update"], "Firmware update", 0),
+        ([HAND, "history"], "slew", 1), (["update"], "Firmware update", 0), ([HAND], "slew", 1),
+        (["next", "provision"], "Provision the next tapped node", 0), (["update"], "Firmware update", 0),
         (["next", "provision"], "Provision the next tapped node", 0), ([ARM], "hand", 1), ([HAND], "slew", 1),
+        (["unheard of"], NONE, 0), ([HAND], "slew", 1), (["next"], "Provision the next tapped node", 0),
+        ([HAND], "slew", 1),
     ):  # fmt: skip
         stage.run("window.view.go(words)", *rest)
         stage.pass_time(20)
-        assert (texts(stage, heads), stage.run(look)) == ([head], [True, tabs]), rest
+        assert (texts(stage, heads), stage.run(look)) == ([head] if head else [], [True, tabs]), rest
     stage.run("window.view.go(['unheard of'])")
     assert (texts(stage, heads), texts(stage, ".detail .empty .lead")) == ([], ["Node not found."])
     change(stage, loaded=False)
@@ -176,7 +179,8 @@ def test_links_sinks_and_the_station_itself_are_shown(stage: Stage) -> None:
     sinks = [running | {"name": "run.csv", "written": 5, "dropped": 0, "detail": "x"},
              running | {"name": "ros2", "written": 1, "dropped": 7, "recorder": True, "detail": "part 2"},
              {"name": "mqtt", "measurement": "m", "state": "failed", "error": "No broker.",
-              "hint": "Start it."}]  # fmt: skip
+              "hint": "Start it."},
+             {"name": "run.csv", "measurement": "n", "state": "waiting", "detail": "It waits."}]  # fmt: skip
     status = {"links": links, "sinks": sinks, "station": {"name": "bench", "fingerprint": "abcd1234"},
               "version": "1.0", "started": NOW, "clock_error": 0.0000123, "write": False,
               "budget": {"used": 12.5, "limit": 1000}}  # fmt: skip
@@ -190,8 +194,9 @@ def test_links_sinks_and_the_station_itself_are_shown(stage: Stage) -> None:
         "run.csv 5 values written, 0 dropped running",
         "ros2 1 value written, 7 dropped running part 2",
         "mqtt 0 values written, 0 dropped failed No broker. Start it.",
+        "run.csv 0 values written, 0 dropped waiting It waits.",
     ]
-    assert stage.run(tones, "[aria-label='Where values go'] .chip") == ["good", "warn", "bad"]
+    assert stage.run(tones, "[aria-label='Where values go'] .chip") == ["good", "warn", "bad", "good"]
     assert texts(stage, "[aria-label=About] dd") == [
         "bench", "abcd 1234", "1.0", "10:00:00", "± 12.3 µs at most", "12.5 of 1000 per second", "read-only",
     ]  # fmt: skip
@@ -452,6 +457,16 @@ def test_keys_zoom_and_move_the_plot_but_never_beyond_now(moving: Stage, key: st
     assert moving.run("return window.plot.range !== null")
     moving.page.keyboard.press("Escape")
     assert moving.run("return [window.plot.range, window.plot.zoomed.size]") == [NONE, 0]
+
+
+@pytest.mark.parametrize(
+    ("key", "left", "right"), [("+", -95, -85), ("-", -110, -70), ("ArrowLeft", -105, -85), ("ArrowRight", -95, -75)]
+)
+def test_keys_zoom_and_move_a_stretch_of_the_past(moving: Stage, key: str, left: float, right: float) -> None:
+    moving.run("window.plot.zoom([hub.now() - 100, hub.now() - 80])")
+    moving.page.get_by_role("img", name="Plot of opening in mm").focus()
+    moving.page.keyboard.press(key)
+    assert moving.run("return window.plot.range.map((one) => one - hub.now())") == pytest.approx([left, right])
 
 
 def test_a_late_answer_to_an_earlier_zoom_is_dropped_and_an_hour_is_the_most(moving: Stage) -> None:

@@ -462,6 +462,19 @@ def test_a_refused_act_says_why_beside_it(stage: Stage) -> None:
     measured(stage, own)
     press(stage, "Measure at 10 Hz")
     assert texts(stage, ".mode .trouble") == ["Not now. Later."]
+    stage.answers(**{"POST measurements": {}})
+    for _ in range(2):
+        measured(stage, own)
+        stage.sent  # noqa: B018
+        press(stage, "Measure at 10 Hz")
+        stage.pass_time(20)
+        asked = [(entry["method"], entry["path"]) for entry in stage.sent if "?" not in entry["path"]]
+        assert asked == [
+            ("DELETE", "measurements/m"),
+            ("POST", "measurements"),
+            ("GET", "measurements"),
+            ("GET", "nodes"),
+        ]
 
 
 def test_a_node_in_a_measurement_is_told_by_its_numbers_and_the_three_commonest_reasons(stage: Stage) -> None:
@@ -524,3 +537,24 @@ def test_a_plot_has_buttons_for_its_length_its_pause_and_the_way_back(stage: Sta
     assert back.is_visible()
     press(stage, "Back to live")
     assert (back.is_hidden(), stage.run("return window.plot.range")) == (True, NONE)
+
+
+def test_a_nodes_plot_has_its_first_twelve_sensors_while_something_is_known_of_one(stage: Stage) -> None:
+    wire = gripper()
+    sensors = [wire["channels"][1] | {"number": number, "name": f"n {number}"} for number in range(2, 16)]
+    mode(stage, channels=[wire["channels"][0], *sensors])
+    plot = "[aria-label=Plot]"
+    assert texts(stage, plot) == ["Plot Press Measure to see live values."]
+    own = {"id": "m", "state": "running", "uuids": [ARM], "owner": "page", "nodes": []}
+    measured(stage, own)
+    assert texts(stage, f"{plot} .label") == [f"n {number}" for number in range(2, 14)]
+    assert texts(stage, f"{plot} .plot-head h3") == ["Plot"]
+    stage.run("state.rings.clear()")
+    measured(stage)
+    assert texts(stage, plot) == ["Plot Press Measure to see live values."]
+    stage.run("hub.ringOf(words[0], 3)", ARM)
+    change(stage)
+    assert len(texts(stage, f"{plot} .label")) == 12, "values of it came before"
+    nodes(stage, wire | {"channels": wire["channels"][:1]})
+    stage.pass_time(20)
+    assert stage.page.locator(plot).is_hidden(), "nothing of an actuator moves there"

@@ -489,6 +489,7 @@ def test_values_set_here_go_out_at_most_twenty_times_a_second_and_the_last_ones_
     assert (text(feeding, ".feed-state"), feeding.said) == ("Values are set on this page.",) * 2
     assert texts(feeding, ".feed-channels label:first-child") == ["opening, m", "force"]
     assert lines(feeding) == [{"value": {"opening": 0.061728, "force": 0}}]
+    assert feeding.run("return document.activeElement.type") == "number", "the first field has the focus"
     entry = feeding.page.get_by_role("spinbutton", name="opening, m")
     feeding.pass_time(100)
     for value in ("0.01", "0.02", "0.03"):
@@ -499,6 +500,10 @@ def test_values_set_here_go_out_at_most_twenty_times_a_second_and_the_last_ones_
     assert lines(feeding) == []
     feeding.pass_time(20)
     assert [line["value"]["opening"] for line in lines(feeding)] == [0.03]
+    for value in ("0.04", "0.05"):
+        entry.fill(value)
+    feeding.pass_time(60)
+    assert [line["value"]["opening"] for line in lines(feeding)] == [0.05], "the next burst too"
     feeding.page.get_by_role("slider").focus()
     feeding.page.keyboard.press("End")
     assert float(entry.input_value()) <= 0.123456

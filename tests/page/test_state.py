@@ -370,3 +370,23 @@ def test_a_token_that_is_removed_ends_the_connection_at_once_and_other_errors_do
     stage.run("window.sockets[1].end(1006)")
     stage.pass_time(320)
     assert (seen(stage), sockets(stage)) == (["lost"], 3)
+
+
+def test_several_changes_of_one_frame_are_announced_once_to_each_listener(stage: Stage) -> None:
+    script = """
+      let [both, one, ended] = [0, 0, 0];
+      const ends = [hub.on("status nodes", () => (both += 1)), hub.on("nodes", () => (one += 1))];
+      hub.on("status nodes", () => (ended += 1))();
+      window.count = () => [both, one, ended];
+      window.ends.push({ end: () => ends.forEach((end) => end()) });
+      hub.changed("status");
+      hub.changed("status", "nodes");
+      hub.changed("nodes");
+      return window.count();
+    """
+    assert stage.run(script) == [0, 0, 0], "in the next frame"
+    stage.pass_time(20)
+    assert stage.run("return window.count()") == [1, 1, 0]
+    stage.run("hub.changed('status')")
+    stage.pass_time(20)
+    assert stage.run("return window.count()") == [2, 1, 0]
