@@ -158,6 +158,41 @@ def test_what_cannot_be_asked_for_is_refused_before_anything_is_opened(
     assert asked.kept is None
 
 
+def test_who_and_what_is_refused_for_what_it_names(asked: Asked, home: Path) -> None:
+    bad, pem = home / "bad.toml", home / "cert.pem"
+    bad.write_text("[angle]\nrange = 7\n")
+    pem.write_text("")
+    for words, code, message in (
+        ((NODE, "--require", str(bad)), 8, "bad.toml"),
+        ((NODE, "--tls-cert", str(pem)), 2, "--tls-key"),
+        (("foot",), 3, "No node or group is known as 'foot'."),
+        (("foot", NODE), 3, "foot"),
+        ((NODE, "--foxglove-at", "10.0.0.9:1"), 2, "10.0.0.9"),
+    ):
+        done = asks(home, "--json", *words)
+        assert done.code == code, done
+        assert message in done.json["error"]["message"] + done.json["error"]["hint"]
+    assert done.json["error"]["hint"] != ""
+    lone = asks(home, "--json", "foot")
+    assert lone.json["error"]["hint"].startswith("Groups: hand. To make one: group create foot UUID")
+    call(home, "group", "delete", "hand", "--yes")
+    assert asks(home, "--json", "foot").json["error"]["hint"].startswith("Groups: none. ")
+    several = asks(home, "--json", "foot", NODE)
+    assert "Groups" not in several.json["error"]["hint"]
+    over_nfc = call(home, "--json", "measure", NODE, "--via", "nfc", "--nfc", "udp:localhost:1")
+    assert (over_nfc.code, over_nfc.json["error"]["message"]) == (2, "Streaming needs CAN or Bluetooth.")
+    assert asked.kept is None
+
+
+def test_a_measurement_that_lost_values_ends_with_the_command_for_a_lower_rate(
+    asked: Asked, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["teds-provision", "measure", "thumb", "--rate=100"])
+    asked.end = MeasurementEnd([], [], None, lower_rate=40.0)
+    done = asks(home, NODE, "--rate", "100")
+    assert done.out.endswith("A lower rate may help: teds-provision measure thumb --rate 40\n")
+
+
 LAST = KeptMeasurement("", group="hand", owner=COMMAND, created="2026-01-31T10:00:00Z", rate=50.0, sinks=("/a.csv",))
 
 
