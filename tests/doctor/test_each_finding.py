@@ -20,6 +20,7 @@ from teds_provision.doctor import fleet, links, machine
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code, intact
 from teds_provision.errors import (
     KeyringUnavailableError,
+    LinkError,
     NoReaderError,
     StoreChangedError,
     StoreError,
@@ -587,3 +588,139 @@ def test_firmware_that_needs_an_operator_is_counted_by_node(system: System, monk
     odd, changed = fleet._firmware(station, RowSample(full=True))
     assert (odd, changed) == ([b"\4", b"\5", b"\6"], [b"\0", b"\4"])
     assert types == [None, "load-cell", *[None] * 6]
+
+
+# -- what the machine does not tell ------------------------------------------------------------------------------------
+
+
+def unreadable(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Have these files vanish between the listing and the reading."""
+    read = Path.read_text
+
+    def read_text(path: Path, *args: Any, **more: Any) -> str:
+        if path.name in names and path.parent.name in ("41", "rfkill0", "gone0"):
+            raise OSError(3, "No such process")
+        return read(path, *args, **more)
+
+    monkeypatch.setattr(Path, "read_text", read_text)
+
+
+def test_what_vanishes_while_it_is_looked_at_is_passed_over(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, command in (("41", "pcscd"), ("42", "pcscd")):
+        (system.at("/proc") / number).mkdir(parents=True)
+        (system.at("/proc") / number / "comm").write_text(f"{command}\n")
+    for name in ("gone0", "can0", "odd0"):
+        folder = system.at(f"/sys/class/net/{name}")
+        folder.mkdir(parents=True)
+        (folder / "type").write_text("280\n" if name != "odd0" else "what\n")
+        (folder / "flags").write_text("0x40081\n")
+    for number in range(2):
+        folder = system.at(f"/sys/class/rfkill/rfkill{number}")
+        folder.mkdir(parents=True)
+        for name, text in (("type", "bluetooth"), ("name", f"hci{number}"), ("soft", "1"), ("hard", "0")):
+            (folder / name).write_text(f"{text}\n")
+    unreadable(monkeypatch, "comm", "type")
+    monkeypatch.setattr(links, "_bitrate", lambda *_: (0, ""))
+    pcscd = one(links._pcscd(system, found=False))
+    assert (pcscd.result, pcscd.fix) == ("ok", ""), "of the other process"
+    assert [found.name for found in links.can_interfaces(system)] == ["can can0"]
+    blocked = Finding("bluetooth switches", "warning", "hci1 is blocked.", "rfkill unblock bluetooth")
+    assert list(links._blocked(system)) == [blocked]
+
+
+def test_whether_the_kernel_makes_can_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = list[bool]()
+
+    def made(*_: Any) -> Any:
+        return SimpleNamespace(close=lambda: closed.append(True))
+
+    monkeypatch.setattr(socket, "socket", made)
+    assert (links._kernel_can(), closed) == (True, [True])
+    for error in (OSError(97, "Address family not supported"), AttributeError("AF_CAN")):
+
+        def refuses(*_: Any, error: Exception = error) -> Any:
+            raise error
+
+        monkeypatch.setattr(socket, "socket", refuses)
+        assert not links._kernel_can()
+
+
+class Bus:
+    """A simulated bus; ``lost`` is raised when something is received."""
+
+    def __init__(self, *frames: Any, lost: Exception | None = None) -> None:
+        self.frames, self.lost, self.closed = list(frames), lost, 0
+        self.spec = SimpleNamespace(source=0xF1, text="udp_multicast:239.74.1.1")
+
+    def send(self, frame: Any) -> None:
+        self.frames.append(frame)
+
+    def receive(self, seconds: float) -> Any:
+        assert 0 < seconds <= 2
+        if self.lost is not None:
+            raise self.lost
+        return self.frames.pop(0) if self.frames else None
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_a_simulated_bus_that_fails_or_is_silent_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    silent = "A frame sent to a simulated bus was not received."
+    route = "sudo ip route add 239.0.0.0/8 dev lo; allow multicast in the firewall"
+    good = links.can_bus.Frame(0x18DAF101, b"doctor")
+    cases: list[tuple[list[Any], tuple[bool, str, str]]] = [
+        ([Bus(), Bus(good)], (True, "", "")),
+        ([Bus(), Bus()], (False, silent, route)),
+        ([Bus(), Bus(links.can_bus.Frame(0x18DAF101, b"Doctor"))], (False, silent, route)),
+        (
+            [Bus(), Bus(lost=LinkError("The bus is gone.", hint="Plug it in."))],
+            (False, "The bus is gone.", "Plug it in."),
+        ),
+        ([Bus(), LinkError("No second bus.", hint="One is enough.")], (False, "No second bus.", "One is enough.")),
+    ]
+    for buses, found in cases:
+        rest = list(buses)
+
+        def opened(_spec: Any, rest: list[Any] = rest) -> Any:
+            bus = rest.pop(0)
+            if isinstance(bus, Exception):
+                raise bus
+            return bus
+
+        monkeypatch.setattr(links.can_bus, "Bus", opened)
+        assert links._self_test("udp_multicast:239.74.1.1") == found
+        assert [bus.closed for bus in buses if isinstance(bus, Bus)] == [1] * sum(isinstance(b, Bus) for b in buses)
+
+
+def test_the_bus_that_was_asked_for_is_listened_to_and_closed(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = replace(system, can="udp_multicast:239.74.1.1")
+    clock, seen = iter([0.0, 0.1, 0.2, 99.0]), list[Any]()
+    rivals = SimpleNamespace(
+        check_frame=seen.append, seen_within=lambda: len(seen) > 1, text="Two of us.", hint="End one."
+    )
+    monkeypatch.setattr(links.bus_multiplexer, "AddressConflicts", lambda source: rivals if source == 0xF1 else None)
+
+    def looked(bus: Bus, *times: float) -> Finding:
+        nonlocal clock
+        clock = iter(times)
+        seen.clear()
+        monkeypatch.setattr(links.can_bus, "Bus", lambda _: bus)
+        monkeypatch.setattr(links, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+        found = one(links.can(asked))
+        assert bus.closed == 1
+        return found
+
+    opens = Finding("can", "ok", "udp_multicast:239.74.1.1 opens.")
+    assert looked(Bus(), 0.0, 0.1, 99.0) == opens
+    assert looked(Bus("a"), 0.0, 0.1, 0.2, 99.0) == opens
+    assert seen == ["a"]
+    assert looked(Bus("a", "b"), 0.0, 0.1, 0.2, 99.0) == Finding("can", "warning", "Two of us.", "End one.")
+    lost = LinkError("The bus is off.", hint="Check the wiring.")
+    assert looked(Bus(lost=lost), 0.0, 0.1) == Finding("can", "failed", "The bus is off.", "Check the wiring.")
+
+
+def test_nobody_is_asked_for_a_passphrase() -> None:
+    with pytest.raises(VaultError) as error:
+        fleet._nobody("Passphrase")
+    assert error.value.message == "doctor never asks for a passphrase."

@@ -7,10 +7,12 @@ import json
 import shutil
 import socket
 from contextlib import closing
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+from teds_provision.doctor import report
 from teds_provision.doctor.checks import Finding, System
 from teds_provision.doctor.report import Mask, build_report
 from teds_provision.protocol.keys import SoftwareKey
@@ -145,3 +147,40 @@ def test_the_name_of_a_station_alone_is_gone(tmp_path: Path) -> None:
     assert mask("crane-7 and crane-78") == "STATION-1 and crane-78"
     (tmp_path / "home" / "store.sqlite3").write_bytes(b"no database")
     assert Mask(System(tmp_path / "home"), with_uuids=True)("crane-7") == "crane-7", "its name cannot be read"
+
+
+def test_a_user_without_a_name_and_a_copy_that_was_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert report._user() == getpass.getuser()
+    for error in (KeyError(0), OSError(2, "No such file")):
+
+        def nameless(error: Exception = error) -> str:
+            raise error
+
+        monkeypatch.setattr(getpass, "getuser", nameless)
+        assert report._user() == ""
+    known = {"click": "8.4.2", "zstd": "1.0"}
+
+    def version(name: str) -> str:
+        if name not in known:
+            raise metadata.PackageNotFoundError(name)
+        return known[name]
+
+    monkeypatch.setattr(report.metadata, "version", version)
+    wanted = ["zstd>=1; extra == 'x'", "click[x]>=8.4.2", "missing (>=1)"]
+    monkeypatch.setattr(report.metadata, "requires", lambda name: wanted if name == "teds-provision" else None)
+    assert list(report._packages().items()) == [("click", "8.4.2"), ("zstd", "1.0")]
+    monkeypatch.setattr(report.metadata, "requires", lambda _: None)
+    assert report._packages() == {}
+
+    def not_installed(name: str) -> list[str]:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(report.metadata, "requires", not_installed)
+    assert report._packages() == {}
+
+
+def test_a_store_that_cannot_be_read_has_no_last_errors(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir(mode=0o700)
+    (tmp_path / "home" / "store.sqlite3").write_bytes(b"no database, but as long as a page" * 200)
+    system = System(tmp_path / "home", workspace=tmp_path, root=tmp_path, environment={})
+    assert report._last_errors(system, Mask(system, with_uuids=True)) == []

@@ -233,8 +233,11 @@ def test_a_receiver_refuses_on_its_own_page_what_came_from_here(station: Station
         for digits, refused in said.items():
             chain = station.plant.pages.chain(digits)
             station.plant.claims.put(chain.id, {A: Claim(refused=refused).to_json()})
+        for name, kind in (("empty", "bundle"), ("receipt", "receipt")):
+            row = ParcelRow(name, "out", SOUTH, cast("Any", kind), "sent", "2026-03-08T12:00:00Z", name, "", "9999")
+            parcels.put(row, b"")
     _note_refused(station)
-    assert [row.id for row in parcels.all("out", "sent")] == bundles[1:]
+    assert [row.id for row in parcels.all("out", "sent")] == [*bundles[1:], "empty", "receipt"]
     assert [parcels.shared_in(bundle)[0][2] for bundle in bundles] == ["refused", "sent", "sent", "sent"]
     states = {row.id: row.state for row in station.handovers.all()}
     assert [states[bundle] for bundle in bundles] == ["dropped", "open", "open", "open"]

@@ -340,6 +340,24 @@ def test_who_holds_the_store_is_named_if_it_lives(place: Path, holder: object, n
     assert lock.holder_of(place) is None, "what the last holder left names no holder"
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_command_looks_often_says_once_whom_it_waits_for_and_gives_up_after_ten_seconds(
+    place: Path, monkeypatch: pytest.MonkeyPatch, told: bool
+) -> None:
+    clock = iter([0.0, 0.0, 0.049, 0.05, 0.1, 0.2, 0.3, 1.0, 2.0, 9.99, 10.0])
+    sleeps, notices = list[float](), list[str]()
+    monkeypatch.setattr(lock, "time", SimpleNamespace(monotonic=lambda: next(clock), sleep=sleeps.append))
+    descriptor = holding(place / "store.lock", json.dumps({"pid": 1, "command": "write", "since": SINCE}))
+    store_lock = StoreLock(place, command="agree", notice=notices.append if told else None)
+    with pytest.raises(StoreLockedError), store_lock:
+        pytest.fail("two hold one lock")
+    os.close(descriptor)
+    assert next(clock, None) is None
+    slow = [0.004, 0.008, 0.016, 0.032, 0.05, 0.05, 0.05] if told else [0.004] * 7
+    assert sleeps == [0.001, 0.002, *slow]
+    assert notices == ([f"Waiting for the store, locked by pid 1 (write) since {SINCE}."] if told else [])
+
+
 def test_a_system_that_locks_nothing_is_a_store_failure(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     holders: list[Any] = [
         StoreLock(place, command="agree"), UsageLock(place / "n.lock", command="agree"), NodeLock(place, NODE),
