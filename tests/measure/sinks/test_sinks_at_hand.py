@@ -1,0 +1,187 @@
+"""Sinks without their packages, servers and peers: what they say, answer and hear. Every peer here is a mock."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.describe.asset_shell import asset_shell
+from teds_provision.errors import TedsProvisionError, UsageError
+from teds_provision.measure.sinks.foxglove_server import FoxgloveServer, MeasurementTopics, _listener
+from teds_provision.measure.sinks.mqtt import MqttSink
+from teds_provision.measure.sinks.ros import child
+from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
+from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
+from tests.measure.sinks.parts import STATION
+
+NONE: Any = None
+
+
+@pytest.mark.parametrize(
+    ("package", "use", "message", "extra"),
+    [
+        ("paho.mqtt.client", lambda: MqttSink("mqtt://127.0.0.1")._prepare((), STATION),
+         "MQTT needs the package paho-mqtt.", "[mqtt]"),
+        ("cyclonedds.core", lambda: Ros2Sink("ros2:7")._prepare((), STATION),
+         "ROS 2 needs the package cyclonedds.", "[ros2]"),
+        ("foxglove", lambda: FoxgloveServer("127.0.0.1:0").start("bench"),
+         "Foxglove needs the package foxglove-sdk.", "[foxglove]"),
+        ("basyx.aas", lambda: asset_shell(NONE),
+         "An Asset Administration Shell needs the package basyx-python-sdk.", "[aas]"),
+    ],
+)  # fmt: skip
+def test_what_needs_a_package_names_it_and_how_it_is_installed(
+    monkeypatch: pytest.MonkeyPatch, package: str, use: Any, message: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(TedsProvisionError) as refused:
+        use()
+    assert refused.value.message == message
+    assert refused.value.hint.startswith("Install it: ")
+    assert extra in refused.value.hint
+    assert isinstance(refused.value, UsageError) == (package in ("foxglove", "basyx.aas"))
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_python_without_rospy_is_refused_with_the_packages_to_install(
+    monkeypatch: pytest.MonkeyPatch, there: bool
+) -> None:
+    asked: list[Any] = []
+    monkeypatch.setenv("ROS_MASTER_URI", "http://elsewhere:11311")
+    monkeypatch.setattr(child, "imports", lambda *words: bool(asked.append(words)) or there)
+    sink = Ros1Sink("ros1:http://bench:11311")
+    if there:
+        sink._prepare((), STATION)
+    else:
+        with pytest.raises(TedsProvisionError) as refused:
+            sink._prepare((), STATION)
+        assert refused.value.message == "/usr/bin/python3 has no rospy."
+        assert refused.value.hint == (
+            "Install it: apt install python3-rospy python3-sensor-msgs python3-diagnostic-msgs"
+        )
+    [(python, packages, environment)] = asked
+    assert (python, packages) == ("/usr/bin/python3", "rospy, sensor_msgs.msg, diagnostic_msgs.msg")
+    assert environment["ROS_MASTER_URI"] == "http://bench:11311"
+
+
+# -- Foxglove ----------------------------------------------------------------------------------------------------------
+
+
+def served() -> tuple[FoxgloveServer, Any, list[MeasurementTopics]]:
+    """Return a server that does not listen, its listener, and the topics of two measurements."""
+    sdk: Any = SimpleNamespace(
+        websocket=SimpleNamespace(ServerListener=object, Parameter=lambda name, *, value: (name, value))
+    )
+    server = FoxgloveServer("127.0.0.1:0")
+    server._sdk = sdk
+    both = [MeasurementTopics(server), MeasurementTopics(server)]
+    server._measurements = both
+    return server, _listener(sdk, server), both
+
+
+def test_a_client_of_foxglove_gets_the_parameters_that_it_names_or_all_and_sets_none() -> None:
+    _, listener, (first, second) = served()
+    first.parameters, second.parameters = {"/a": "1", "/b": "2"}, {"/c": "3"}
+    assert listener.on_get_parameters(None, []) == [("/a", "1"), ("/b", "2"), ("/c", "3")]
+    assert listener.on_get_parameters(None, ["/c", "/a", "/x"]) == [("/a", "1"), ("/c", "3")]
+    given = [SimpleNamespace(name="/b", value="99")]
+    assert listener.on_set_parameters(None, given) == [("/b", "2")]
+    assert first.parameters == {"/a": "1", "/b": "2"}
+
+
+def test_a_late_subscriber_of_foxglove_gets_the_last_facts_of_that_topic_alone() -> None:
+    _, listener, (first, second) = served()
+    logged: list[tuple[str, bytes]] = []
+
+    def channel(name: str) -> Any:
+        return SimpleNamespace(log=lambda message, *, log_time: logged.append((name, message)) or log_time)
+
+    first.channels = {"/arm/teds": channel("first"), "/arm/angle": channel("value")}
+    second.channels = {"/arm/teds": channel("second")}
+    first.latest, second.latest = {"/arm/teds": b"facts", "/gone/teds": b"old"}, {}
+    for topic in ("/arm/teds", "/arm/angle", "/gone/teds", "/x"):
+        listener.on_subscribe(None, SimpleNamespace(topic=topic))
+    assert logged == [("first", b"facts")]
+
+
+# -- ROS 2 -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_dds_domain_that_cannot_be_joined_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    core = pytest.importorskip("cyclonedds.core")
+    domain = pytest.importorskip("cyclonedds.domain")
+
+    def full(*_words: Any, **_how: Any) -> None:
+        raise core.DDSException(core.DDSException.DDS_RETCODE_OUT_OF_RESOURCES)
+
+    monkeypatch.setenv("CYCLONEDDS_URI", "file:///nowhere.xml")
+    monkeypatch.setattr(domain, "DomainParticipant", full)
+    with pytest.raises(TedsProvisionError, match=r"^DDS domain 7 cannot be joined: .*\.$") as refused:
+        Ros2Sink("ros2:7")._prepare((), STATION)
+    assert refused.value.hint == "Check CYCLONEDDS_URI, and that not more than 30 programs use the domain."
+
+
+def test_a_topic_of_ros_2_that_is_taken_back_is_shown_no_more_and_one_that_never_was_changes_nothing() -> None:
+    sink = Ros2Sink("ros2:7")
+    sink._writers = {"/arm/teds": object()}
+    sink._retire("/leg/teds")
+    assert (list(sink._writers), sink._unshown) == (["/arm/teds"], False)
+    sink._retire("/arm/teds")
+    assert (sink._writers, sink._unshown) == ({}, True)
+
+
+class Float64(SimpleNamespace):
+    """A set point of one channel."""
+
+
+class JointState(SimpleNamespace):
+    """Set points of joints."""
+
+
+def test_set_points_of_ros_2_go_to_their_channel_or_to_the_joints_that_they_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What DDS cannot read just now is read a little later."""
+    core = pytest.importorskip("cyclonedds.core")
+    sink = Ros2Sink("ros2:7")
+    sink._types = SimpleNamespace(Float64=Float64, JointState=JointState)
+    heard: list[Any] = []
+    monkeypatch.setattr(sink, "_command", lambda *words: heard.append(words))
+    monkeypatch.setattr(sink, "_joint_command", lambda *words: heard.append(words))
+    joints = JointState(name=["a"], position=[1.0], velocity=[2.0], effort=[3.0])
+    waits = iter([None, core.DDSException(core.DDSException.DDS_RETCODE_ERROR), None])
+    batches = {"/cmd": iter([[Float64(data=1.5), object()], []]), "/joints": iter([[joints], [Float64(data=2.5)]])}
+    attached: list[object] = []
+    paused: list[float] = []
+
+    class WaitSet:
+        def __init__(self, _participant: object) -> None:
+            pass
+
+        def attach(self, condition: object) -> None:
+            attached.append(condition)
+
+        def wait(self, _span: object) -> None:
+            step = next(waits, "end")
+            if step == "end":
+                sink._ending.set()
+            elif step is not None:
+                raise step
+
+    def take(topic: str) -> Any:
+        return lambda *, N: next(batches[topic], [])
+
+    sink._readers = {
+        "/cmd": (SimpleNamespace(take=take("/cmd")), "aa", 3),
+        "/joints": (SimpleNamespace(take=take("/joints")), "", 0),
+    }
+    monkeypatch.setattr(core, "WaitSet", WaitSet)
+    monkeypatch.setattr(core, "ReadCondition", lambda reader, _state: reader)
+    monkeypatch.setattr("teds_provision.measure.sinks.ros.ros2.time", SimpleNamespace(sleep=paused.append))
+    sink._hear()
+    assert heard == [("aa", 3, 1.5), (["a"], [1.0], [2.0], [3.0]), ("", 0, 2.5)]
+    assert len(attached) == len(sink._attached) == 2, "each reader once"
+    assert paused == [0.2]
