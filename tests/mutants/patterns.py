@@ -4380,6 +4380,8 @@ PATTERNS = (
         "above - turn",
         "above + turn",
         "tests/teds/test_interpreter.py",
+    ),
+    Pattern(
         "a copy whose parcel was given up is not open any more",
         "_give_up",
         'handover is None or handover.mode != "copy" or handover.state != pending.OPEN',
