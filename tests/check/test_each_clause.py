@@ -48,6 +48,18 @@ class _OwnPoint:
     point: ClassVar[bytes] = b""
 
 
+@dataclass(frozen=True)
+class _AsBefore:
+    """The same octets as in the reply of the Request before."""
+
+    begin: int
+    end: int
+    before: ClassVar[bytes] = b""
+
+    def __call__(self, payload: bytes) -> bytes:
+        return payload[: self.begin] + self.before[self.begin : self.end] + payload[self.end :]
+
+
 def _identity(**members: Any) -> Change:
     """Return a change of Identify; a number is added."""
 
@@ -89,6 +101,14 @@ def _longer(payload: bytes) -> bytes:
 
 def _shorter(payload: bytes) -> bytes:
     return payload[:-1]
+
+
+def _turned(payload: bytes) -> bytes:
+    return payload[3:6] + payload[:3] + payload[6:]
+
+
+def _without_can(payload: bytes) -> bytes:
+    return replace(Identity.decode(payload), can_address=0).encode()
 
 
 def _without_security(payload: bytes) -> bytes:
@@ -171,6 +191,44 @@ ROWS: list[Row] = [
     ("rotation-keeps", "128.7", -1, _identity(sequence=1), "Confirm took the sequence"),
     ("rotation-keeps", "1.2", 3, lambda payload: payload[:-1] + bytes([payload[-1] ^ 1]), "its TEDS are not"),
     ("reset", "128.7", 2, _identity(state=NodeState.KEYED), "After Reset the node is keyed"),
+    ("identify", "128.7", 1, _shorter, "Identify (128.7): "),
+    ("list-ascending", "128.11", 1, _turned, "does not ascend, or names one twice"),
+    ("list-ascending", "128.11", 1, lambda payload: payload + payload[-3:], "does not ascend, or names one twice"),
+    ("list-ascending", "128.11", 1, _longer, "octets are no multiple of 3."),
+    ("query-absent", "1.1", 1, _status(Attribute.NOT_AVAILABLE), "NotAvail is due"),
+    ("query-absent", "1.1", 1, _status(size=1), "NotAvail is due"),
+    ("read-end", "1.2", -1, _xor(3, 1), "and 0 octets came"),
+    ("security-state", "128.7", 1, _identity(epoch=1), "Identify says epoch"),
+    ("about", "128.21", 1, lambda payload: payload[:20], "About (128.21): "),
+    ("agreement-tags", "128.1", 2, _longer, "Request (128.1): 165 octets are due, 166 came."),
+    ("agreement-tags", "128.1", 2, _at(20, b"\4" + bytes(64)), "Request (128.1): "),
+    ("agreement-tags", "128.1", 2, _xor(85, 1), "Request (128.1): tagN is wrong."),
+    ("agreement-tags", "128.1", 2, _xor(101, 1), "tagN is right, sigN does not verify under field 101."),
+    ("agreement-tags", "128.1", 2, lambda p: p[:101] + bends.high(p[101:]), "s of sigN is in the upper half"),
+    ("agreement-epoch", "128.1", 2, _xor(19, 1), "Request offers epoch 4; 5 is due. A known slip fits: the stored epoch is offered"),
+    ("agreement-epoch", "128.1", 2, _at(16, b"\5\0\0\0"), "the epoch in the reply is little-endian"),
+    ("agreement-low-s", "128.1", -1, lambda p: p[:101] + bends.high(p[101:]), "s of sigN is in the upper half"),
+    ("agreement-fresh", "128.1", 4, _AsBefore(0, 16), "answered with the same nonceN."),
+    ("agreement-fresh", "128.1", 4, _AsBefore(20, 85), "answered with the same one-time key En."),
+    ("agreement-fresh", "128.1", 4, _OwnPoint(20), "En is the node's identity key"),
+    ("open", "128.3", 1, _longer, "c has 9 octets, 8 are due."),
+    ("open", "128.3", 2, _longer, "Open (128.3): "),
+    ("open", "128.3", 2, _xor(70, 1), "Open (128.3): "),
+    ("sealed-residues", "1.2", 3, _xor(0, 1), "sealed, an inner reply of"),
+    ("address-moves", "128.7", 1, _without_can, "The board has no CAN, and so no address to move."),
+    ("commit-uuid", "1.1", 1, _status(Attribute.READ_ONLY), "The Meta-TEDS of this node is read-only."),
+    ("commit-values", "128.7", -1, _identity(sequence=1), "(field 110 with 9), and changed the node."),
+    ("commit-values", "128.11", -1, lambda payload: payload[:-3], "(field 110 with 9), and changed the node."),
+    ("commit-values", "teds", -1, _xor(20, 1), "(field 110 with 9), and changed the node."),
+    ("commit", "128.7", -1, _identity(state=NodeState.KEYED), "provisioned is due."),
+    ("reset", "128.7", 2, _identity(epoch=1), "Reset took epoch"),
+    ("reset", "128.7", 2, _identity(sequence=1), "Reset took epoch"),
+    ("reset", "128.11", -1, lambda payload: payload[:-3], "the other TEDS of the node are not what they were."),
+    ("reset", "128.9", 2, _xor(0, 1), "the proof does not verify under field 101 at this epoch."),
+    ("reset-forgets", "128.7", 1, _identity(state=NodeState.KEYED), "The node was not reset."),
+    ("operate-expires", "128.19", 1, lambda _: b"", "Operation (128.19): "),
+    ("drive-replay", "128.16", 1, _shorter, "Clock (128.16): "),
+    ("drive-replay", "4.1", 1, 6, "Operate (4.1) of channel 4, sealed, lease 30: "),
 ]  # fmt: skip
 
 
@@ -210,6 +268,8 @@ class _Bench:
 
     def answer(self, command: Command, reply: Reply) -> Reply:
         change = self.due(f"{command.command_class}.{command.function}")
+        if (command.command_class, command.function) == (128, 1) and reply.ok and change is None:
+            _AsBefore.before = reply.payload
         if change is None:
             return reply
         return Reply(True, change(reply.payload)) if callable(change) else Reply(False, bytes([change]))
