@@ -205,7 +205,7 @@ ROWS: list[Row] = [
     ("agreement-tags", "128.1", 2, _xor(85, 1), "Request (128.1): tagN is wrong."),
     ("agreement-tags", "128.1", 2, _xor(101, 1), "tagN is right, sigN does not verify under field 101."),
     ("agreement-tags", "128.1", 2, lambda p: p[:101] + bends.high(p[101:]), "s of sigN is in the upper half"),
-    ("agreement-epoch", "128.1", 2, _xor(19, 1), "Request offers epoch 4; 5 is due. A known slip fits: the stored epoch is offered"),
+    ("agreement-epoch", "128.1", 2, _xor(19, 1), "A known slip fits: the stored epoch is offered"),
     ("agreement-epoch", "128.1", 2, _at(16, b"\5\0\0\0"), "the epoch in the reply is little-endian"),
     ("agreement-low-s", "128.1", -1, lambda p: p[:101] + bends.high(p[101:]), "s of sigN is in the upper half"),
     ("agreement-fresh", "128.1", 4, _AsBefore(0, 16), "answered with the same nonceN."),
