@@ -18,7 +18,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.station import Station
-from teds_provision.teds.calibration import Calibration, read_calibrations
+from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import Channel, ChannelKind
 from teds_provision.teds.codec.access_code import AccessCode
@@ -220,6 +220,70 @@ def test_points_beyond_another_range_of_raw_values_do_not_fit(raw: tuple[float, 
     assert own is not None
     of = replace(own, calibration=replace(own.calibration, raw_range=raw, method=""))
     assert misfit(replace(calibration, raw_range=(-100.0, 80000.0)), had, had, of) == why
+
+
+def test_the_range_that_a_calibration_states_goes_before_that_of_its_samples() -> None:
+    calibration, had = angle()
+    assert misfit(replace(calibration, raw_range=(0.0, 60000.0)), had, had, None) == ""
+    assert misfit(calibration, replace(had, kind=None), had, None) == (
+        "it was made for another type of channel (unknown, not sensor)"
+    )
+
+
+@pytest.mark.parametrize(("high", "fits"), [(1_000_000.4375, True), (1_000_000.5, False), (999_999.5625, True)])
+def test_of_samples_of_floats_a_range_is_the_same_within_four_steps_of_a_float32(high: float, fits: bool) -> None:
+    """Four steps of a Float32 at a million are 0.477; whole numbers have one more."""
+    calibration, had = angle()
+    floats = replace(had, sample=SampleForm(1, 4))
+    own = load_profile(ANGLE).channel(1)
+    assert own is not None
+    fields = {**own.fields, "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 24}}
+    of = replace(own, fields=fields, calibration=replace(own.calibration, raw_range=(0.0, high), method=""))
+    why = misfit(replace(calibration, raw_range=(0.0, 1e6)), floats, floats, of)
+    assert (why == "") is fits
+    if not fits:
+        assert why.startswith("it was made for raw 0 to 1000000, and this channel gives raw 0 to 1000000.5")
+
+
+def test_an_actuator_may_have_fewer_raw_values_than_before() -> None:
+    """Its points are values that are set; the guard looks whether their raw numbers can be given."""
+    calibration, had = angle()
+    own = load_profile(ANGLE).channel(1)
+    assert own is not None
+    of = replace(own, calibration=replace(own.calibration, raw_range=(10_000.0, 60_000.0), method=""))
+    assert misfit(calibration, had, had, of).startswith("it covers raw 0 to 65535")
+    acting = replace(had, kind=ChannelKind.ACTUATOR)
+    assert misfit(replace(calibration, actuator=True), acting, acting, of) == ""
+
+
+def test_of_several_inputs_the_channels_own_one_is_held_against_its_raw_values() -> None:
+    _, had = angle()
+    own = load_profile(ANGLE).channel(1)
+    assert own is not None
+    of = replace(own, calibration=replace(own.calibration, raw_range=(0.0, 1000.0), method=""))
+    for ends, why in (
+        ((0.0, 100.0), ""),
+        ((0.0, 2000.0), "it covers raw 0 to 2000, and this channel gives raw 0 to 1000"),
+    ):
+        parts = (CalibrationInput(2, 1, (0.0, 65535.0), (0.0,)), CalibrationInput(1, 1, ends, (0.0,)))
+        two = Calibration(1, "polynomial", parts, (0.0, 1.0, 0.0, 0.0), unit=parse_unit("degree"))
+        assert misfit(two, had, had, of) == why
+        assert misfit(two, had, replace(had, high=0.1), None) == "", "its points are not known: the guard has them all"
+
+
+@pytest.mark.parametrize(("below", "fits"), [(0.0, True), (1.6e-4, True), (2.05e-4, False), (25.0, False)])
+def test_points_in_degrees_celsius_are_held_against_new_limits_to_four_steps_of_a_float32(
+    below: float, fits: bool
+) -> None:
+    """Four steps of a Float32 at 398.15 K are 0.00019 K."""
+    profile = load_profile("temperature-sensor")
+    made = read_calibrations("raw,value [degC]\n0,-40\n21120,125\n", "t.csv", profile)
+    had = Sheet.from_blocks(profile.build(bytes(10), calibration=made).blocks).channels[0]
+    sure = replace(had, uncertainty=0.0)
+    why = misfit(made[1], sure, replace(sure, high=398.15 - below), None)
+    assert (why == "") is fits
+    if below == 25.0:
+        assert why == "its point of 125 °C is beyond the high limit of 100 °C"
 
 
 def test_a_method_that_the_type_asks_for_is_compared() -> None:

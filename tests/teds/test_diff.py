@@ -277,6 +277,74 @@ def test_small_changes_of_a_curve_are_stated_to_the_noise(
     assert change.text.endswith(", stated uncertainty 0.2 N.")
 
 
+def curve_of(profile: Profile, old: Calibration, new: Calibration) -> list[str]:
+    """Return what a change of the first channel's calibration is called, without its beginning."""
+    found = diff_blocks(*(profile.build(UUID, calibration={1: curve}).blocks for curve in (old, new)))
+    return [change.text.partition(": ")[2] for change in found]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        # readings go as far as the calibration says that raw values go
+        (line(0, 1e-4, raw_range=(0.0, 4095.0)), line(0, 2e-4, raw_range=(0.0, 4095.0)),
+         "gain +100 %, at full scale +0.4095 N, stated uncertainty 0.2 N."),
+        (line(0, 1e-4), line(0, 2e-4), "gain +100 %, at full scale +6.5535 N, stated uncertainty 0.2 N."),
+        # of a gain of zero there is no share
+        (line(5, 0), line(0, 1e-4), "at the low end -5 N, at full scale +1.5535 N, stated uncertainty 0.2 N."),
+        # below the noise of the ends, above a quarter of it
+        (line(0, 10 / 65535), line(5e-6, 10 / 65535), "at most +5e-06 N, stated uncertainty 0.2 N."),
+        (line(0, 10 / 65535), line(1e-6, 10 / 65535), "calibration: the same content, other octets."),
+    ],
+)  # fmt: skip
+def test_a_change_of_a_curve_in_whole_words(old: Calibration, new: Calibration, text: str, finger: Profile) -> None:
+    assert curve_of(finger, old, new) == [text]
+
+
+def test_without_a_stated_uncertainty_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "sure.toml").write_text(FORCE + "uncertainty = 0.0\n")
+    sure = load_profile(tmp_path / "sure.toml", [shipped_profiles()])
+    assert curve_of(sure, line(0, 1e-4), line(0, 2e-4)) == ["gain +100 %, at full scale +6.5535 N."]
+
+
+def test_a_change_of_an_actuator_is_in_raw_numbers_at_values_and_names_no_uncertainty() -> None:
+    gripper = load_profile("gripper", [shipped_profiles()])
+
+    def table(middle: float) -> Calibration:
+        points = [(0, 0.0), (middle, 60.0), (4095, 110.0)]
+        return replace(fit(points, "table", channel=1, actuator=True), unit=parse_unit("mm"))
+
+    (text,) = curve_of(gripper, table(2000), table(2100))
+    assert text.endswith("at most +100 raw (at 60).")
+
+
+def test_a_change_of_temperatures_is_a_difference() -> None:
+    sensor = load_profile("temperature-sensor", [shipped_profiles()])
+
+    def from_(low: float) -> Calibration:
+        curve = fit([(0, low), (21120, 125.0)], "linear", channel=1)
+        return replace(curve, unit=parse_unit("degC"), raw_range=(0.0, 21120.0))
+
+    (text,) = curve_of(sensor, from_(-40.0), from_(-30.0))
+    assert text == "gain -6.06 %, at the low end +10 °C, stated uncertainty 0.5 °C."
+
+
+@pytest.mark.parametrize("way", ["to two", "to one"])
+def test_curves_of_another_number_of_inputs_are_compared_field_by_field(way: str, finger: Profile) -> None:
+    parts = (CalibrationInput(1, 1, (0, 65535), (0,)), CalibrationInput(2, 1, (0, 65535), (0,)))
+    two = Calibration(1, "polynomial", parts, (0, 1e-9, 1e-4, 0), unit=parse_unit("N"))
+    pair = (line(0, 1e-4), two) if way == "to two" else (two, line(0, 1e-4))
+    texts_ = curve_of(finger, *pair)
+    assert "Coefs 0, 0.0001 -> 0, 1e-09, 0.0001, 0." in texts_ or "Coefs 0, 1e-09, 0.0001, 0 -> 0, 0.0001." in texts_
+    assert ("CalInput 2, ChanNum added: 2." if way == "to two" else "CalInput 2, ChanNum removed (was 2).") in texts_
+
+
+def test_a_field_without_a_name_is_called_by_its_number() -> None:
+    meta = {"UUID": UUID, "OholdOff": 1.0, "TestTime": 0.0, "MaxChan": 3}
+    old, new = ({(0, 1): teds.compose(1, {**meta, "200": octets})} for octets in (b"\xaa", b"\xbb"))
+    assert texts(diff_blocks(old, new)) == ["node: field 200 aa -> bb."]
+
+
 def text_based(*texts: tuple[str, object]) -> bytes:
     return teds.compose(11, [("Text", {"LangCode": language, "Text": text}) for language, text in texts])
 
