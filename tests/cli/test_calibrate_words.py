@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision import measure
+from teds_provision import __version__, measure, provisioning
 from teds_provision.measure.capture import CaptureResult
 from teds_provision.measure.zero import ZeroOrder, ZeroResult
+from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.progress import StepResult
+from teds_provision.teds.calibration import fit_points
 from teds_provision.teds.calibration.points import Point
 from teds_provision.teds.channel import Channel
 from teds_provision.teds.image import Image
@@ -247,3 +251,101 @@ def test_a_certificate_of_a_fit_says_what_it_does_not_state(home: Path, tmp_path
     assert dcc.read_text().startswith("<?xml")
     assert dcc.stat().st_mode & 0o777 == 0o644
     assert "dcc" not in json.loads(call(home, "--json", "calibrate", "fit", file, passphrase=None).out)
+
+
+@pytest.mark.parametrize(
+    ("words", "message", "hint"),
+    [
+        (("points.csv", "--laboratory", "lab.toml"), "--laboratory belongs to a certificate.", "Add --dcc OUT.xml."),
+        (("a.xml",), "A certificate is fitted for a transducer type.",
+         "Add --profile P, or see: teds-provision show {}/a.xml"),
+        (("points.csv", "-p", "magnetic-angular-position-sensor", "--method", "table"),
+         "The profile already sets the method.", "Omit --method and --degree, or write them into the file."),
+        (("points.csv", "-p", "magnetic-angular-position-sensor", "--degree", "2"),
+         "The profile already sets the method.", "Omit --method and --degree, or write them into the file."),
+    ],
+)  # fmt: skip
+def test_a_fit_that_contradicts_itself_is_refused_and_writes_nothing(
+    words: tuple[str, ...], message: str, hint: str, home: Path, tmp_path: Path
+) -> None:
+    for name, text in (("points.csv", FIT), ("lab.toml", ""), ("a.xml", "<a/>")):
+        (tmp_path / name).write_text(text)
+    named = [str(tmp_path / word) if "." in word else word for word in words]
+    certified = () if "--laboratory" in words else ("--dcc", tmp_path / "out.xml")
+    done = call(home, "--json", "calibrate", "fit", *named, *certified, passphrase=None)
+    error = done.json["error"]
+    assert (done.code, error["message"], error["hint"]) == (2, message, hint.format(tmp_path))
+    assert not (tmp_path / "out.xml").exists()
+
+
+def test_the_method_of_the_command_goes_before_that_of_the_file(home: Path, tmp_path: Path) -> None:
+    plain, file = tmp_path / "plain.csv", tmp_path / "points.csv"
+    plain.write_text(FIT.partition("raw,")[1] + FIT.partition("raw,")[2])
+    file.write_text(FIT)
+
+    def kind(name: Path, *words: str) -> tuple[str, str]:
+        shown = call(home, "--json", "calibrate", "fit", name, *words, passphrase=None).json
+        return shown["method"], shown["kind"]
+
+    assert kind(plain)[0] == "table"
+    assert kind(plain, "--method", "polynomial") == ("polynomial", "polynomial of degree 3")
+    assert kind(plain, "--method", "polynomial", "--degree", "1") == ("polynomial", "polynomial of degree 1")
+    assert kind(file) == ("polynomial", "polynomial of degree 1")
+    assert kind(file, "--degree", "2") == ("polynomial", "polynomial of degree 2")
+    assert kind(file, "--method", "table")[0] == "table"
+
+
+def test_the_largest_error_of_what_was_left_out_counts_without_its_sign(home: Path, tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text("raw,value [degree]\n0,0\n100,90\n200,210\n300,270\n")
+    found = call(home, "--json", "calibrate", "fit", file, passphrase=None).json
+    # without 100 its value would be 105, without 200 it would be 180
+    assert found["left_out"] == {"maximum": pytest.approx(30.0), "rms": pytest.approx(math.sqrt((225 + 900) / 2))}
+    shown = call(home, "calibrate", "fit", file, passphrase=None)
+    assert shown.out.endswith("Leave-one-out error of the inner points: up to 30 degree, rms 23.7 degree.\n")
+
+
+def test_a_fit_for_a_type_is_that_of_the_profile_and_of_the_guard(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, orders = tmp_path / "joint.csv", list[BuildOrder]()
+    file.write_text("raw,value [degree]\n0,0\n32768,180.5\n65535,360\n")
+    words = ("calibrate", "fit", file, "--profile", "magnetic-angular-position-sensor")
+    found = call(home, "--json", *words, passphrase=None).json
+    assert (found["channel"], found["unit"], found["warnings"]) == (1, "degree", [])
+    assert [row["raw"] for row in found["residuals"]] == [0, 32768, 65535]
+    one, two = (
+        replace(calibration, channel=number)
+        for number in (1, 2)
+        for calibration in fit_points(FIT, "points.csv").values()
+    )
+
+    def prepare(_station: Any, order: BuildOrder) -> Any:
+        orders.append(order)
+        return SimpleNamespace(calibrations={2: two, 1: one}, warnings=("Its slope is odd.",))
+
+    monkeypatch.setattr(provisioning.build, "prepare", prepare)
+    done = call(home, "--json", *words, passphrase=None)
+    assert [fit["channel"] for fit in done.json["channels"]] == [1, 2]
+    assert (done.json["channel"], done.json["warnings"]) == (1, ["Its slope is odd."])
+    assert orders == [BuildOrder("magnetic-angular-position-sensor", calibration=file)]
+    shown = call(home, *words, passphrase=None)
+    assert shown.err == "Warning: Its slope is odd.\n"
+    lines = [line for line in shown.out.splitlines() if line.startswith("channel")]
+    assert [line.partition(":")[0] for line in lines] == ["channel 1", "channel 2"]
+
+
+def test_a_certificate_has_the_laboratory_the_node_the_day_and_the_program(home: Path, tmp_path: Path) -> None:
+    file, dcc, lab = tmp_path / "points.csv", tmp_path / "joint.xml", tmp_path / "lab.toml"
+    file.write_text("# node: 8d4d9da65281f7000000\n" + FIT)
+    lab.write_text('laboratory = "Metrology of Stockholm"\n')
+    words = ("calibrate", "fit", file, "--dcc", dcc)
+    done = call(home, "--json", *words, "--laboratory", lab, passphrase=None)
+    assert done.code == 0, done
+    text = dcc.read_text()
+    assert "Metrology of Stockholm" in text
+    assert "8d4d9da65281f7000000" in text
+    assert f"<dcc:release>v{__version__.partition('.dev')[0]}<" in text
+    assert str(datetime.now(UTC).date()) in text
+    call(home, *words, passphrase=None)
+    assert "Metrology of Stockholm" not in dcc.read_text(), "written again, without the laboratory"
