@@ -251,7 +251,8 @@ def test_the_demo_of_the_page_says_where_it_is_and_what_to_type_and_leaves_nothi
     api = SimpleNamespace(login_url=lambda: "http://127.0.0.1:8351/login?once")
     monkeypatch.setattr(page, "_daemon", daemon)
     monkeypatch.setattr(page.client, "connect", lambda home: nullcontext(api))
-    monkeypatch.setattr(page, "_measured", lambda _api: None)
+    measured: list[Any] = []
+    monkeypatch.setattr(page, "_measured", measured.append)
     monkeypatch.setattr(page.subprocess, "run", run)
     monkeypatch.setattr(page.tempfile, "mkdtemp", lambda prefix: str((tmp_path / prefix).mkdir() or tmp_path / prefix))
     folder = tmp_path / "teds-provision-page-"
@@ -265,4 +266,4 @@ def test_the_demo_of_the_page_says_where_it_is_and_what_to_type_and_leaves_nothi
         assert demo.tap == f"teds-provision node run {folder / 'oven'} --nfc {options[3]}"
     profile = ["--profile", "temperature-sensor", "--name", "oven"]
     assert ran == [["--json", "node", "create", str(folder / "oven"), *profile]]
-    assert (len(said), folder.exists()) == (2, False)
+    assert (len(said), folder.exists(), measured) == (2, False, [api])

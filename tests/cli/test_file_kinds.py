@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.cli.file_kinds import mistaken_file
+from teds_provision.cli.file_kinds import _kind_of, mistaken_file
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from tests.bench import PASSPHRASE
@@ -73,3 +73,57 @@ def test_a_file_of_the_right_kind_is_not_explained(home: Path, folder: Path) -> 
     (folder / "angle.csv").write_text("raw,value [degree]\n0,zero\n")
     error = call(home, "--json", "calibrate", "fit", "angle.csv").json["error"]
     assert "angle.csv is" not in error["hint"]
+
+
+LONG = " " * 70
+
+
+@pytest.mark.parametrize(
+    ("octets", "kind"),
+    [
+        (b"\x89MCAP0\r\n", "a recording (MCAP)"),
+        (b"PAR1abc", "a recording (Parquet)"),
+        (b"%PDF-1.7", "a PDF"),
+        (b"PK\x03\x04abc", "a ZIP archive or an office document"),
+        (b"-----BEGIN PUBLIC KEY-----", "a public key (PEM)"),
+        (b"-----BEGIN ENCRYPTED PRIVATE KEY-----", "a private key (PEM)"),
+        (b"-----BEGIN PRIVATE KEY-----", "a private key (PEM)"),
+        (b"-----BEGIN EC PRIVATE KEY-----", "a private key (PEM)"),
+        (b"-----BEGIN CERTIFICATE-----", "an X.509 certificate (PEM)"),
+        (b" \r\n\t", "an empty file"),
+        (b'<?xml version="1.0"?><!-- a <b> --><x:whitelist/>', "a whitelist"),
+        (b"<teds-set/>", "TEDS in XML"),
+        (b"<digitalCalibrationCertificate/>", "a calibration certificate (DCC)"),
+        (b"<robot/>", "a robot description (xacro, URDF)"),
+        (b"<other/>", None),
+        (b"<?only?>", None),
+        (b'{"event": "x"}', "a recording (JSON lines)"),
+        (b'{"@context": ["https://www.w3.org/2022/wot/td/v1.1"]}', "a Thing Description (JSON)"),
+        (b'{"submodels" : []}', "an Asset Administration Shell (JSON)"),
+        (b'{"recipients": []}', "a handover bundle"),
+        (b'{"whitelist": []}', "a whitelist"),
+        (f'{{{LONG}"whitelist": []}}'.encode(), None),
+        (b'{"format": "nothing/1"}', None),
+        (b'{"a": 1}', None),
+        (b"# teds-provision measurement\n", "a recording (text)"),
+        (b'VERSION "1"', "a DBC file"),
+        (b"\nBO_ 12 A: 8 B", "a DBC file"),
+        (b"[fileinfo]\n", "an EDS file"),
+        (b"; x\n[DeviceInfo]\n", "an EDS file"),
+        (b"title = 'x'\nextends = 'y'\n", "a transducer profile (TOML)"),
+        (b"[channel.1]\n", "a transducer profile (TOML)"),
+        (b"# date\n\nRaw; value [degree]\n", "a calibration (CSV)"),
+        (b"raw,other\n", None),
+        (b"UUID\tname\tProfile\n", "a sheet of boards (CSV)"),
+        (b"uuid,calibration\n", "a sheet of boards (CSV)"),
+        (b"uuid,name\n", "a whitelist"),
+        (b"hello", None),
+    ],
+)  # fmt: skip
+def test_what_a_file_is_shows_in_its_beginning(tmp_path: Path, octets: bytes, kind: str | None) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(octets)
+    found = _kind_of(file)
+    assert found == kind
+    assert _kind_of(tmp_path) is None
+    assert _kind_of(tmp_path / "none") is None

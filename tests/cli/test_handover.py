@@ -573,3 +573,92 @@ def test_nodes_to_hand_over_are_named_or_all_of_them(homes: Homes, words: list[s
         2,
         "Name the nodes, or use --all. (see: teds-provision export-keys --help)",
     )
+
+
+@pytest.mark.parametrize(("bundles", "held"), [(1, True), (2, False), (3, True)])
+def test_the_plan_of_an_export_names_nodes_holders_and_keys_to_compare(
+    monkeypatch: pytest.MonkeyPatch, bundles: int, held: bool
+) -> None:
+    monkeypatch.setattr(handover, "peer_name", lambda _station, digits: f"lab {digits}")
+    monkeypatch.setattr(handover, "spoken", lambda digits: f"spoken {digits}")
+    uuids = [bytes([number]) * 10 for number in range(1, 25)]
+    names = {uuid: SimpleNamespace(name="thumb" if uuid == uuids[0] else None) for uuid in uuids}
+    station: Any = SimpleNamespace(
+        nodes=SimpleNamespace(get_many=lambda some: {uuid: names[uuid] for uuid in some}),
+        name="north",
+        fingerprint="aa",
+    )
+    share = len(uuids) // bundles
+    plans: list[Any] = [
+        SimpleNamespace(
+            mode="move",
+            nodes=[SimpleNamespace(uuid=uuid, epoch=3) for uuid in uuids[at : at + share]],
+            expires=datetime(2026, 11, 30, tzinfo=UTC),
+            skipped=[(bytes(10), "revoked")] if at == 0 else [],
+            also_held_by=["5e"] if held else [],
+            receivers=[SimpleNamespace(name="south", fingerprint="bb")],
+            id="7",
+        )
+        for at in range(0, len(uuids), share)
+    ]
+    head, *lines = handover._plan_text(plans, station).splitlines()
+    assert head.startswith("Move 24 nodes, to be imported by 2026-11-")
+    if bundles > 1:
+        assert lines.pop(0) == f"  in {bundles} bundles"
+    assert lines[:20] == [
+        f"  {uuids[0].hex()}  epoch 3  thumb",
+        *(f"  {uuid.hex()}  epoch 3" for uuid in uuids[1:20]),
+    ]
+    assert "4 more" in lines[20]
+    assert lines[21:] == [
+        f"  not {bytes(10).hex()}: revoked",
+        *(["  also held by lab 5e from an earlier copy, until the keys are rotated"] if held else []),
+        "Compare by voice:",
+        "  to   south",
+        "       spoken bb",
+        "  from north",
+        "       spoken aa",
+        "A move: this station stops using the keys at once. It is only certain to be locked out when the other station"
+        " has rotated them at its first contact.",
+    ]
+
+
+@pytest.mark.parametrize(("mode", "known"), [("copy", True), ("move", False)])
+def test_the_plan_of_an_import_names_what_it_does_with_each_node_and_ban(
+    monkeypatch: pytest.MonkeyPatch, mode: str, known: bool
+) -> None:
+    monkeypatch.setattr(handover, "peer_name", lambda _station, digits: f"lab {digits}")
+    monkeypatch.setattr(handover, "spoken", lambda digits: f"spoken {digits}")
+    monkeypatch.setattr(handover, "fingerprint", lambda ca: ca * 64)
+    uuids = [bytes([number]) * 10 for number in range(1, 44)]
+    nodes = [SimpleNamespace(node=SimpleNamespace(uuid=uuid), decision="import", why="", notes=()) for uuid in uuids]
+    nodes[0].decision, nodes[0].why = "refused", "it is given away"
+    nodes[1].notes = ("Its name is taken.", "It has no pin.")
+    nodes[42].notes = ("The last one too.",)
+    ban = SimpleNamespace(uuid=bytes(10), why="stolen")
+    bundle = SimpleNamespace(mode=mode, sender="5e", ca="c")
+    plan: Any = SimpleNamespace(
+        opened=SimpleNamespace(bundle=bundle), nodes=nodes, denied=[ban], passed_over=[(ban, "it was lifted")],
+        ca_is_known=known,
+    )  # fmt: skip
+    head, *lines = handover.import_text(cast(Any, SimpleNamespace(fingerprint="aa")), plan).splitlines()
+    assert head == f"A {mode} of 43 nodes from lab 5e"
+    assert lines[:2] == [f"  refused  {uuids[0].hex()}  it is given away", f"  import   {uuids[1].hex()}"]
+    assert len([line for line in lines if line.startswith(("  import ", "  refused "))]) == 40
+    assert "3 more" in lines[40]
+    means = {
+        "copy": "A copy: the sender keeps the same keys, and either station can impersonate a node to the other.",
+        "move": "A move: each key is rotated at the first contact; until then, the sender can still use it.",
+    }
+    assert lines[41:] == [
+        f"  {uuids[1].hex()}: Its name is taken.",
+        f"  {uuids[1].hex()}: It has no pin.",
+        f"  {uuids[42].hex()}: The last one too.",
+        f"  revoked  {bytes(10).hex()}  stolen",
+        f"  its ban of {bytes(10).hex()} is ignored: it was lifted",
+        "Compare by voice:",
+        "  from spoken 5e",
+        "  to   spoken aa",
+        *([] if known else [f"The CA {'c' * 32} will be trusted for these nodes only."]),
+        means[mode],
+    ]

@@ -502,3 +502,28 @@ def test_a_channel_that_is_named_has_its_number_by_the_datasheet_of_every_node(m
         numbers(station, [UUID, OTHER], ["opening"])
     assert refused.value.message == f"Channel 'opening' has different numbers: 2 on {NODE}, 5 on {OTHER.hex()}."
     assert refused.value.hint == "Measure them one by one."
+
+
+@pytest.mark.parametrize(
+    ("group", "wished", "changes"),
+    [
+        ("hand", {}, {"group": "hand", "uuids": (), "actuators": False}),
+        ("", {"ros1": True, "channels": [2, 1, 2]}, {"channels": (2, 1)}),
+        ("", {"ros2": True, "rate": 20.0, "require": "x"}, {"rate": 20.0, "require": "x"}),
+        ("", {"ros2": True, "actuators": False}, {"actuators": False}),
+        ("", {}, {"actuators": False}),
+    ],
+)
+def test_a_measurement_is_kept_as_it_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group: str, wished: dict[str, Any], changes: dict[str, Any]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    defaults: dict[str, Any] = dict.fromkeys(measure_command.OPTIONS)
+    usual = {"channels": [], "actuators": True, "ros1": False, "ros2": False, "require": ""}
+    kept = measure_command._asked(group, [UUID, OTHER], ["a.csv", "ros2"], defaults | usual | wished)
+    assert (kept.id, kept.owner) == ("", "command")
+    assert kept.sinks == (str(tmp_path / "a.csv"), "ros2")
+    found = {"group": kept.group, "uuids": kept.uuids, "actuators": kept.actuators, "channels": kept.channels}
+    found |= {"rate": kept.rate, "require": kept.require}
+    plain = {"group": None, "uuids": (UUID, OTHER), "actuators": True, "channels": (), "rate": None, "require": ""}
+    assert found == plain | changes

@@ -335,3 +335,72 @@ def test_the_end_does_not_wait_for_a_reader_that_stopped(monkeypatch: pytest.Mon
     assert not lines.end()
     pipe.go.set()
     lines._thread.join(PATIENCE)
+
+
+@pytest.fixture
+def ran(home: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return the settings with which the service is run; it ends at once."""
+    found: list[Any] = []
+    monkeypatch.setattr(commands.service_run, "run", lambda _station, settings, _on_event: found.append(settings))
+    return found
+
+
+def test_a_service_without_its_packages_says_how_to_get_them(
+    home: Path, ran: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = commands.importlib.util.find_spec
+    absent = ("starlette", "websockets")
+    monkeypatch.setattr(
+        commands.importlib.util, "find_spec", lambda name, *more: None if name in absent else find(name, *more)
+    )
+    done = call(home, "--json", "ncap", "run")
+    assert (done.code, done.json["error"]["message"], ran) == (2, "ncap run needs starlette, websockets.", [])
+    assert "[ncap]" in done.json["error"]["hint"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message", "hint"),
+    [
+        (["--yes"], "--yes requires --adopt.", "Add --adopt --detection transparent."),
+        (["--unverified"], "--unverified requires --adopt.", "Add --adopt --detection transparent."),
+        (["--rate", "5"], "--rate and --frozen require --measure.", "Add --measure all."),
+        (["--frozen"], "--rate and --frozen require --measure.", "Add --measure all."),
+    ],
+)
+def test_options_of_the_service_that_need_another(
+    home: Path, ran: list[Any], words: list[str], message: str, hint: str
+) -> None:
+    done = call(home, "--json", "ncap", "run", *words)
+    assert (done.code, done.json) == (2, {"error": {"code": "usage", "message": message, "hint": hint}})
+    assert ran == []
+
+
+def test_the_service_gets_what_was_asked_for_and_a_type_that_nobody_knows_is_named(home: Path, ran: list[Any]) -> None:
+    words = ["--measure", "type:nothing", "--rate", "5", "--ros2", "--mqtt", "mqtt://localhost", "--no-scalars"]
+    done = call(home, "ncap", "run", "--can", "virtual:a", "--can", "virtual:a", "--can", "virtual:b", *words)
+    assert done.code == 0, done
+    assert "Warning: Nothing is measured until a node of that type comes: " in done.err
+    [settings] = ran
+    assert settings.places == ("can:virtual:a", "can:virtual:b")
+    assert (settings.sinks, settings.scalars, settings.measure, settings.rate) == (
+        ("ros2", "mqtt://localhost"), False, "type:nothing", 5.0,
+    )  # fmt: skip
+    assert (settings.http, settings.unverified) == (None, False)
+    quiet = call(home, "ncap", "run", "--measure", "all", "--ros1")
+    assert ("Nothing is measured" in quiet.err, ran[1].sinks, ran[1].places, ran[1].scalars) == (
+        False,
+        ("ros1",),
+        (),
+        True,
+    )
+
+
+def test_a_writer_that_hangs_at_the_end_delays_the_exit_of_no_service_that_ended_in_order(
+    home: Path, ran: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended: list[int] = []
+    monkeypatch.setattr(commands.os, "_exit", ended.append)
+    for written in (True, False):
+        monkeypatch.setattr(DaemonLog, "end", lambda _log, written=written: written)
+        assert call(home, "ncap", "run").code == 0
+        assert ended == ([] if written else [0])

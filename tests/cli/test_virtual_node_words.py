@@ -6,10 +6,12 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from teds_provision.cli.node import virtual_nodes
 from teds_provision.cli.node.virtual_nodes import ActuatorLines
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import ActuatorReading
@@ -338,3 +340,100 @@ def test_a_reset_by_hand_and_its_plan(home: Path, tmp_path: Path) -> None:
         )
         assert (done.json if isinstance(out, dict) else done.out) == out
         assert "--dry-run" not in words or (folder / "flash.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("given", "kinds"),
+    [
+        ({"nfc": "udp:1"}, ["nfc"]),
+        ({"can": "virtual:x"}, ["can"]),
+        ({"ble": "usb:0"}, ["ble"]),
+        ({"nfc": "udp:1", "can": "virtual:x", "ble": "usb:0"}, ["ble", "nfc", "can"]),
+    ],
+)
+def test_a_node_is_served_on_each_link_that_is_named(
+    monkeypatch: pytest.MonkeyPatch, given: dict[str, str], kinds: list[str]
+) -> None:
+    made: list[Any] = []
+    tapped: list[Any] = []
+
+    class Server:
+        def __init__(self, kind: str, *_: Any, **how: Any) -> None:
+            self.kind, self.how, self.added = kind, how, list[Any]()
+            self.restarted, self.announce_press = (lambda *_: None), (lambda *_: None)
+            self.address = SimpleNamespace(octets=bytes(6))
+            made.append(self)
+
+        def tapped(self) -> None:
+            tapped.append(self.kind)
+
+        def send_data(self, *_: Any, **__: Any) -> None: ...
+
+        def add(self, node: Any, *, counts_as_tapped: Any, measuring_handler: Any) -> None:
+            self.added.append((node, counts_as_tapped(), measuring_handler is node))
+
+    node: Any = SimpleNamespace(
+        in_factory_state=lambda: True,
+        board=None,
+        flash_file=SimpleNamespace(path=Path("/x/flash.json")),
+        when_restarted=lambda _call: None,
+        announces_presses_over=lambda _call: None,
+        streams_over=lambda *_: None,
+    )
+    room = virtual_nodes.node_room
+    for name, kind in (("NfcServer", "nfc"), ("CanServer", "can"), ("BleServer", "ble")):
+        monkeypatch.setattr(room, name, lambda *given, kind=kind, **how: Server(kind, *given, **how))
+    monkeypatch.setattr(room, "StaticAddress", lambda folder, *, factory: (folder, factory))
+    app: Any = SimpleNamespace(warn=lambda _text: None)
+    links: dict[str, Any] = {"nfc": None, "can": None, "ble": None} | given
+    servers = virtual_nodes._servers(app, [node], tag=None, pace=True, wait_time=23, **links)
+    assert [cast(Any, server).kind for server in servers] == kinds
+    by_kind = {server.kind: server for server in made}
+    if "can" in by_kind:
+        assert by_kind["can"].added == [(node, "nfc" not in by_kind, True)], "with a reader, only it is a tap"
+    if "nfc" in by_kind:
+        how = by_kind["nfc"].how
+        assert (how["wt_int"], how["pace"]) == (20, True), "in steps of four"
+        how["extras"].field(present=True)
+        assert tapped == (["ble"] if "ble" in by_kind else [])
+        assert len(how["extras"].after()) == ("ble" in by_kind)
+
+
+@pytest.mark.parametrize(
+    ("hardware", "source", "percent", "made", "warned"),
+    [
+        ({}, "noise", None, False, False),
+        ({}, "sine:2", None, False, True),
+        ({}, "noise", 50.0, True, False),
+        ({}, "sine:2", 50.0, True, True),
+    ],
+)
+def test_a_node_without_channels_needs_no_source(
+    tmp_path: Path, hardware: dict[Any, bytes], source: str, percent: float | None, made: bool, warned: bool
+) -> None:
+    warnings: list[str] = []
+    app: Any = SimpleNamespace(warn=warnings.append)
+    lines: Any = SimpleNamespace(observer_of=lambda _uuid: None)
+    file = FlashFile.create(tmp_path / "a", uuid=bytes.fromhex(UUID))
+    board = virtual_nodes._boards(app, lines, source, percent, None)(file)
+    assert (board is not None) is made
+    text = f"Node {UUID} has no channels, so --source has no effect: create it with --teds or --profile."
+    assert warnings == ([text] if warned else [])
+    if board is not None:
+        assert board.battery is not None
+
+
+def test_signals_reach_every_node_that_runs() -> None:
+    course: list[str] = []
+
+    def node(name: str) -> Any:
+        return SimpleNamespace(
+            reset_by_hand=lambda: course.append(f"reset {name}"),
+            press_button=lambda: course.append(f"press {name}"),
+            tim=SimpleNamespace(flash=SimpleNamespace(uuid=name.encode())),
+        )
+
+    lines: Any = SimpleNamespace(note_reset=lambda uuid: course.append(f"line {bytes.fromhex(uuid).decode()}"))
+    virtual_nodes._reset_all([node("a"), node("b")], lines)
+    virtual_nodes._press_all([node("a"), node("b")])
+    assert course == ["reset a", "line a", "reset b", "line b", "press a", "press b"]

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from teds_provision.cli.main import run
+from teds_provision.cli.station import profile as profile_command
 
 
 @pytest.fixture
@@ -213,3 +214,59 @@ def test_new_writes_into_the_working_folders_profiles_else_the_homes_and_says_wh
     assert lines[0] == "# Transducer type b: like gripper, except for the settings below."
     assert not Path("profiles/b.toml").exists()
     assert 'extends = "gripper"' in lines
+
+
+MAPPED = """\
+[values]
+title = "title"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--from", "a.xml"], "--from needs --map, and no --extends."),
+        (["--map", "a.xml"], "--from needs --map, and no --extends."),
+        (["--from", "a.xml", "--map", "a.xml", "--extends", "gripper"], "--from needs --map, and no --extends."),
+        (["--from", "a.xml", "--message", "x"], "--message needs --from dbc:FILE."),
+    ],
+)
+def test_a_new_type_comes_from_one_source(
+    workspace: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    Path("a.xml").write_text("<a/>")
+    error = json_of(capsys, "profile", "new", "mine", *words, exit_code=2)["error"]
+    assert error["message"] == message
+    assert not Path("home/profiles").exists()
+
+
+def test_what_a_mapping_makes_is_checked_like_any_profile(
+    workspace: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("a.xml").write_text("<a/>")
+    Path("map.toml").write_text(MAPPED)
+    given: list[Any] = []
+    texts = ['title = "Mine"\nextends = "gripper"\n', 'title = "Mine"\nfoo = 1\n']
+
+    def made(octets: bytes, rules: str, **how: Any) -> str:
+        given.append((octets, rules, how))
+        return texts.pop(0)
+
+    monkeypatch.setattr(profile_command, "profile_from_xml", made)
+    words = ("profile", "new", "mine", "--from", "a.xml", "--map", "map.toml")
+    assert json_of(capsys, *words)["profiles"][0]["name"] == "mine"
+    assert given == [(b"<a/>", MAPPED, {"name": "mine", "file": "a.xml", "by": "map.toml"})]
+    before = Path("home/profiles/mine.toml").read_bytes()
+    assert "there is no channel" in json_of(capsys, *words, exit_code=8)["error"]["message"]
+    assert Path("home/profiles/mine.toml").read_bytes() == before
+
+
+def test_a_new_type_may_have_the_64_characters_of_a_name_and_a_folder_that_can_be_made(
+    workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, code in (("a" * 64, 0), ("0.a-b_c", 0), ("a" * 65, 2), ("-a", 2), ("A", 2), ("", 2)):
+        json_of(capsys, "profile", "new", "--dry-run", "--", name, exit_code=code)
+    Path("home").mkdir(exist_ok=True)
+    Path("home/profiles").write_text("a file")
+    error = json_of(capsys, "profile", "new", "mine", exit_code=7)["error"]
+    assert error["message"] == "Cannot create home/profiles: File exists."
