@@ -89,3 +89,56 @@ def test_deleting_a_group_that_does_not_exist_says_so(measured: Path, option: tu
     done = call(measured, "group", "delete", "cranes", *option)
     assert done.code == 0, "every command can be repeated"
     assert "there is no group 'cranes'" in done.err
+
+
+OTHER = bytes.fromhex("91aa9da65281f7000000")
+
+
+def test_what_the_group_commands_print(measured: Path) -> None:
+    for uuid in (ONE, OTHER):
+        call(measured, "whitelist", "add", uuid.hex(), "--fingerprint", uuid.hex() + "00" * 22)
+    with Station.inspect(measured) as store:
+        store.measurements.keep(KeptMeasurement("5e6f7a8b", group="crane", owner="page"))
+    both = "1a2b3c4d, 5e6f7a8b"
+    one, other = ONE.hex(), OTHER.hex()
+    for words, out, err in (
+        ("list", f"crane: {one}\nspare: {one}\n", ""),
+        (f"create arm {other} {one} {other}", f"arm: {one}, {other}\n", ""),
+        ("create leg", "leg: no nodes yet\n", ""),
+        (f"create foot {one} --dry-run", f"foot: {one}\n", "Plan, nothing is changed:\n"),
+        (f"add leg {one} {other}", f"leg: {one}, {other}\n", ""),
+        (f"add leg {one} --dry-run", f"leg: {one}, {other}\n", "Plan, nothing is changed:\n"),
+        (f"remove leg {one}", f"leg: {other}\n", ""),
+        ("delete leg --dry-run", f"arm: {one}, {other}\ncrane: {one}\nleg: {other}\nspare: {one}\n",
+         "Would delete group leg.\n"),
+        ("delete leg", f"arm: {one}, {other}\ncrane: {one}\nspare: {one}\n", ""),
+        ("delete leg --dry-run", f"arm: {one}, {other}\ncrane: {one}\nspare: {one}\n",
+         "Nothing to do: there is no group 'leg'.\n"),
+        ("delete leg", f"arm: {one}, {other}\ncrane: {one}\nspare: {one}\n",
+         "Nothing to do: there is no group 'leg'.\n"),
+        ("delete crane --dry-run", f"arm: {one}, {other}\ncrane: {one}\nspare: {one}\n",
+         f"Would delete group crane and its measurements {both}.\n"),
+        ("delete crane --yes", f"arm: {one}, {other}\nspare: {one}\n", f"Also deleted: measurements {both}.\n"),
+        ("delete arm --yes", f"spare: {one}\n", ""),
+        ("delete spare", "There are no groups yet. To create one: teds-provision group create NAME UUID …\n", ""),
+    ):  # fmt: skip
+        done = call(measured, "group", *words.split())
+        assert (done.code, done.out, " ".join(done.err.split())) == (0, out, err.strip()), words
+    log = call(measured, "--json", "log").json["entries"]
+    assert [entry["detail"] for entry in log if entry["act"] == "group" and entry["outcome"] == "deleted"] == [
+        {"group": "leg", "measurements": []},
+        {"group": "crane", "measurements": ["1a2b3c4d", "5e6f7a8b"]},
+        {"group": "arm", "measurements": []},
+        {"group": "spare", "measurements": []},
+    ]
+    assert [entry["detail"] for entry in log if entry["act"] == "measure" and entry["outcome"] == "ended"] == [
+        {"id": "1a2b3c4d", "group": "crane"},
+        {"id": "5e6f7a8b", "group": "crane"},
+    ]
+
+
+def test_a_plan_names_the_measurements_that_would_end(measured: Path) -> None:
+    plan = call(measured, "--json", "group", "delete", "crane", "--dry-run").json
+    assert (plan["ended"], [group["name"] for group in plan["groups"]]) == (["1a2b3c4d"], ["crane", "spare"])
+    assert "ended" not in call(measured, "--json", "group", "delete", "spare", "--dry-run").json
+    assert kept(measured) == ["1a2b3c4d"]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -136,7 +138,30 @@ def test_show_limits_what_is_shown_and_never_what_is_counted(tmp_path: Path) -> 
     for chosen in (("--channel", "3", "--channel", "palm"), ("--channel", "palm", "--channel", "3")):
         unknown = call(home, "record", "show", str(path), *chosen)
         assert unknown.code == 3
-        assert "has no channel 'palm'" in unknown.err
+        assert f"{path} has no channel 'palm'." in " ".join(unknown.err.split())
+        assert "It has 1 (angle), 2 (force), 3 (oil)." in " ".join(unknown.err.split())
+    unknown = call(home, "--json", "record", "show", str(path), "--channel", "9")
+    message, hint = (
+        json.loads(unknown.out.splitlines()[-1])["error"]["message"],
+        "It has 1 (angle), 2 (force), 3 (oil).",
+    )
+    assert (message, json.loads(unknown.out.splitlines()[-1])["error"]["hint"]) == (f"{path} has no channel 9.", hint)
+    assert call(home, "record", "show", str(path), "--channel", "OIL", "--limit", "1").code == 0
+
+
+def test_a_line_has_the_local_time_with_its_zone_and_milliseconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", "CET-1")
+    time.tzset()
+    try:
+        first, *_ = call(tmp_path / "home", "record", "show", str(recorded(tmp_path / "run.mcap"))).out.splitlines()
+        until_when = call(tmp_path / "home", "record", "info", str(tmp_path / "run.mcap")).out.splitlines()[1]
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert re.fullmatch(r"2026-11-18 12:06:40\.\d{3}\+01:00  \S+/\S+ .+", first), first
+    assert re.fullmatch(r"From 2026-11-18 12:06:40\.\d{3}\+01:00 until 2026-11-18 \S+\+01:00", until_when), until_when
 
 
 def test_what_info_prints_of_a_recording(tmp_path: Path) -> None:
