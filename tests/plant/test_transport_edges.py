@@ -416,6 +416,82 @@ def test_events_of_pages_that_were_given_up_are_stated_again(station: Station) -
     assert [id for _, id, _ in station.plant.outbox(9)] == [names[0], names[2]]
 
 
+def test_own_pages_that_this_station_did_not_sign_stop_a_registry_and_no_folder(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Into a folder anybody writes; into a registry members alone."""
+    held = station.plant.roster
+    assert held is not None
+    read: tuple[list[str], list[int]] = ["page"], [3, 5]
+    monkeypatch.setattr(fetching, "read_pages", lambda pages, _roster, of: read if (pages, of) == (
+        [7], station.fingerprint) else ([], []))  # fmt: skip
+
+    def own(*, folder: bool) -> tuple[Any, list[str]]:
+        done: Any = stub(remarks=[])
+        transport = stub(pages=lambda _of, above: [above], carries_all=folder, where="office")
+        return sync._own_pages(station, transport, held, done, 7), done.remarks
+
+    assert own(folder=True) == (
+        ["page"], ["office: 2 files in this station's folder that it did not sign; ignored"]
+    )  # fmt: skip
+    assert station.plant.alarms.all() == []
+    with pytest.raises(NotAuthenticError) as error:
+        own(folder=False)
+    assert (error.value.message, error.value.hint) == (
+        "office has pages of this station that its key did not sign, from number 3 on.",
+        "To delete them there: registry sql --mend owner 3",
+    )
+    [alarm] = station.plant.alarms.all()
+    assert (alarm.code, alarm.about, alarm.n) == ("junk", station.fingerprint, 3)
+    assert alarm.why == "office has pages that this station's key did not sign"
+    read[1].clear()
+    assert own(folder=False) == own(folder=True) == (["page"], [])
+
+
+@pytest.mark.parametrize(
+    ("earlier", "answered", "reused", "asked"),
+    [
+        (None, 0, False, "new"),
+        ("kept", None, False, "kept"),  # not answered yet: the very same request again
+        ("kept", 9, False, "new"),  # what it signed then is no newer than the node's datasheet
+        ("kept", 10, True, None),
+    ],
+)
+def test_an_earlier_request_is_repeated_and_its_answer_used_if_it_is_newer(
+    station: Station, monkeypatch: pytest.MonkeyPatch, earlier: str | None, answered: int | None, reused: bool,
+    asked: str | None,
+) -> None:  # fmt: skip
+    station.unlock()
+    requests = list[str]()
+
+    def taken(_s: Any, _r: Any, _k: Any, _w: Any, request: str, answer: Any) -> Any:
+        return sign_requests.SignResult(cast("Any", f"image of {request}"), answer, reused=False)
+
+    def request_signature(request: Any) -> int:
+        requests.append(request.octets)
+        return 12
+
+    kept = None if earlier is None else stub(request="kept", answer=answered)
+    monkeypatch.setattr(sign_requests, "_earlier", lambda *_: kept)
+    monkeypatch.setattr(sign_requests, "_taken", taken)
+    monkeypatch.setattr(sign_requests, "open_request", lambda octets, _: stub(octets=octets, hash="h"))
+    monkeypatch.setattr(sign_requests, "_new_request", lambda *_: stub(octets="new", hash="h"))
+    stored = list[Any]()
+    for part, name in ((station.plant.line, "put_sign_request"), (station.datasheets, "keep_draft")):
+        monkeypatch.setattr(part, name, stored.append)
+    monkeypatch.setattr(station.nodes, "remember", lambda uuid, *, sequence: stored.append((uuid, sequence)))
+    wanted: Any = stub(sequence=9, office="office", job="job", profile="load-cell")
+    done = sign_requests.by_office(
+        station, cast("Any", stub(request_signature=request_signature)), cast("Any", None),
+        cast("Any", stub(uuid=NODE)), wanted, None,
+    )  # fmt: skip
+    assert requests == ([] if asked is None else [asked])
+    assert done.reused is reused
+    assert (done.image, done.sequence) == (f"image of {asked or 'kept'}", 12 if asked else answered)
+    assert len(stored) == (3 if asked else 0), "a new signature is durable with its draft and its sequence"
+    assert not stored or stored[2] == (NODE, 12)
+
+
 def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:
     for registry in (None, REGISTRY):
         transport = stub(

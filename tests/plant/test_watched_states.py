@@ -336,6 +336,22 @@ class Listener:
         return said
 
 
+def test_a_registry_that_moved_is_followed_and_its_former_place_let_go(station: Station) -> None:
+    watch, _, _ = watching(station)
+    done = list[str]()
+    transport: Any = SimpleNamespace(close=lambda: done.append("closed"))
+    listener: Any = SimpleNamespace(interrupt=lambda: done.append("interrupted"))
+    watch._transport, watch._listener, watch._place, watch._look_again = transport, listener, "one", 60.0
+    watch._follow("one")
+    assert (watch._transport, watch._look_again, done) == (transport, 60.0, [])
+    watch._follow("two")
+    assert (watch._transport, watch._place, watch._look_again) == (None, "two", 0.0)
+    assert done == ["closed", "interrupted"]
+    watch._listener = None
+    watch._follow(None)
+    assert (watch._place, done) == (None, ["closed", "interrupted"])
+
+
 def test_who_listens_wakes_the_sync_and_sweeps_each_minute(home: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
     watch, _, _ = watching(home.north)
     listener, clock = (

@@ -377,6 +377,25 @@ def test_a_system_that_locks_nothing_is_a_store_failure(place: Path, monkeypatch
         pytest.fail("it is locked")
 
 
+def test_a_usage_lock_shows_whether_its_last_holder_ended_well(place: Path) -> None:
+    path = place / "n.lock"
+
+    def left_behind(*, shared: bool = False) -> bool:
+        with UsageLock(path, command="measure", shared=shared) as held:
+            assert (held.is_taken, held.is_taken_alone) == (True, not shared)
+            return held.left_behind
+
+    assert [left_behind(), left_behind(shared=True), left_behind()] == [False] * 3
+    path.write_bytes(b'{"pid": 1, "command": "measure"}')  # its holder was killed
+    assert [left_behind(), left_behind()] == [True, False]
+    with UsageLock(path, command="measure", shared=True):
+        left_behind(shared=True)
+        assert path.read_bytes(), "the other one still holds it"
+    assert path.read_bytes() == b""
+    free = UsageLock(path, command="measure")
+    assert (free.is_taken, free.holder, free.is_taken_alone) == (False, None, False)
+
+
 def test_a_full_disk_hides_neither_a_lock_nor_its_end(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock, "_write_at_start", full)
     monkeypatch.setattr(os, "ftruncate", full)
