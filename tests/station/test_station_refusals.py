@@ -7,6 +7,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,6 +18,7 @@ from teds_provision.errors import (
     FrozenError,
     NotFoundError,
     PolicyError,
+    StoreChangedError,
     StoreError,
     UnknownMasterKeyError,
     UsageError,
@@ -28,7 +30,9 @@ from teds_provision.station import measurements, snapshot
 from teds_provision.station import station as stations
 from teds_provision.station.datasheets import unpacked
 from teds_provision.station.node_keys import NodeKeys
+from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.pages import PageRow
+from teds_provision.station.plant.plant import HOME_FILE, RosterRow
 from teds_provision.station.snapshot import Relation, is_damage, relation
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.lock import UsageLock, UsageLockTakenError
@@ -388,3 +392,147 @@ def test_only_a_damaged_file_is_set_aside(code: int | None, damage: bool) -> Non
     assert is_damage(failure) is damage
     failure.__cause__ = OSError(11, "11 is EAGAIN here")
     assert not is_damage(failure)
+
+
+# -- the plant that was joined ----------------------------------------------------------------------------------------
+
+FIRST, SECOND = "11111111-2222-4333-8444-555555555555", "21111111-2222-4333-8444-555555555555"
+
+
+def test_a_registry_is_joined_again_moved_or_left_for_another(station: Station) -> None:
+    station.unlock()
+    plant = station.plant
+
+    def joined(registry: str, url: str | None, **before: Any) -> tuple[Any, ...]:
+        with station.transaction():
+            if before:
+                record = plant.record()
+                assert record is not None
+                plant.put_record(replace(record, **before))
+            plant.join(registry, url)
+        found = plant.joined
+        assert found is not None
+        return found.registry, found.url, found.acknowledged, found.left
+
+    assert joined(FIRST, None) == (FIRST, None, 0, None)
+    assert joined(FIRST, "postgresql://one", acknowledged=7) == (FIRST, "postgresql://one", 7, None)
+    assert joined(FIRST, "postgresql://one", left="now") == (FIRST, "postgresql://one", 7, None)
+    assert joined(FIRST, None) == (FIRST, "postgresql://one", 7, None)
+    assert joined(FIRST, "postgresql://two") == (FIRST, "postgresql://two", 0, None), "it has acknowledged nothing yet"
+    with station.transaction():
+        plant.alarms.put(Alarm("junk", "", 1, "why"))
+    assert joined(FIRST, "postgresql://two", acknowledged=3) == (FIRST, "postgresql://two", 3, None)
+    assert len(plant.alarms.all()) == 1
+    assert joined(SECOND, None) == (SECOND, None, 0, None)
+    assert plant.alarms.all() == [], "everything of the first one is forgotten"
+
+
+def test_a_roster_that_another_program_put_there_is_not_believed(station: Station) -> None:
+    station.unlock()
+    plant = station.plant
+    with station.transaction():
+        plant.join(FIRST, None)
+        plant.put_roster(RosterRow(1, "ab" * 32, b"octets", False, "now"))
+    assert plant.roster is None, "none is in force"
+    with station.transaction():
+        plant.put_roster(RosterRow(2, "cd" * 32, b"octets", True, "now"))
+        plant._store.execute("UPDATE rosters SET held = 0")
+        plant._store.execute("UPDATE rosters SET held = 1 WHERE version = 1")
+    with pytest.raises(StoreChangedError) as error:
+        _ = plant.roster
+    assert (error.value.message, error.value.hint) == (
+        "The roster in the store was changed by another program and is not trusted.",
+        "To get it again: teds-provision registry sync",
+    )
+
+
+def roster(station: Station, *roles: str, **more: Any) -> Any:
+    members = {station.fingerprint: frozenset(roles), **more.pop("members", {})}
+
+    def roles_of(digits: str) -> frozenset[str]:
+        return members.get(digits, frozenset())
+
+    return SimpleNamespace(
+        name="plant", removed=(), by_key=dict.fromkeys(members), member=members.get, roles_of=roles_of,
+        has=lambda digits, role: role in roles_of(digits), name_of=lambda digits: digits[:5], **more,
+    )  # fmt: skip
+
+
+def test_a_role_is_required_of_a_member_alone(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = station.plant
+    plant.require_role("line", "keys no board", "See: registry status")
+    monkeypatch.setattr(type(plant), "roster", roster(station, "line"))
+    plant.require_role("line", "keys no board", "See: registry status")
+    with pytest.raises(PolicyError) as error:
+        plant.require_role("sign", "signs no datasheet", "See: registry status")
+    assert (error.value.message, error.value.hint) == (
+        "This station does not have the role sign in plant, so it signs no datasheet.", "See: registry status"
+    )  # fmt: skip
+
+
+def test_signatures_wait_for_pages_of_a_keeper_that_a_member_has_seen(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper, base, audit, me = "keepr" + "a" * 59, "based" + "b" * 59, "audit" + "c" * 59, station.fingerprint
+    members = {keeper: frozenset({"keeper"}), base: frozenset({"base"}), audit: frozenset({"audit"})}
+    monkeypatch.setattr(type(station.plant), "roster", roster(station, "keeper", members=members))
+    chains = {keeper: SimpleNamespace(counted=(4, "h"))}
+    heads = list[tuple[str, str, int, str]]()
+    monkeypatch.setattr(station.plant.pages, "chains", lambda: chains)
+    monkeypatch.setattr(station.plant.pages, "heads", lambda: heads)
+
+    def behind(*reported: tuple[str, str, int]) -> str:
+        heads[:] = [(*one, "h") for one in reported]
+        rules = station.plant.signer_rules(["stranger", base])
+        assert rules is not None
+        assert rules.counted == {name: chain.counted[0] for name, chain in chains.items()}
+        assert rules.added == {"stranger"}
+        return rules.keepers_behind
+
+    missing = "pages of the keeper keepr are missing here: based names page 5, and the last one here is 4"
+    assert behind() == behind((base, keeper, 4)) == ""
+    assert behind((base, keeper, 4), (base, keeper, 5)) == missing
+    assert behind((audit, keeper, 5)) == "", "an auditor's word counts for nothing"
+    assert behind(("stranger" + "d" * 56, keeper, 5)) == ""
+    assert behind((base, audit, 5), (keeper, base, 5)) == "", "they are no keepers"
+    assert behind((base, me, 5)) == "", "a keeper always has its own"
+    chains.clear()
+    assert behind((base, keeper, 1)).endswith("based names page 1, and the last one here is 0")
+
+
+def test_the_name_of_a_home_is_made_once_and_damage_is_reported(station: Station) -> None:
+    digits = station.plant.home
+    assert (len(digits), station.plant.home) == (16, digits)
+    path = station.home / HOME_FILE
+    for octets in (b"", b"0123456789abcde", b"0123456789abcdefg", b"0123456789ABCDEF", b"\xff" * 16):
+        path.write_bytes(octets)
+        with pytest.raises(StoreError) as error:
+            _ = station.plant.home
+        assert (error.value.message, error.value.hint) == (
+            f"{path} is damaged.", "Remove it; the next registry sync creates a new one."
+        )  # fmt: skip
+    path.write_bytes(b" 0123456789abcdef\n")
+    assert station.plant.home == "0123456789abcdef"
+    path.unlink()
+    assert station.plant.home not in ("0123456789abcdef", digits)
+
+
+def test_signers_are_read_in_a_fork_by_a_connection_of_its_own(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station.unlock()
+    claims, digest = station.plant.claims, bytes(range(32))
+    with station.transaction():
+        claims.put_digests(station.plant.pages.chain("ab" * 32), [(digest, 3, False), (digest, 5, True)])
+    before = claims._store
+    found = [("ab" * 32, 3, False), ("ab" * 32, 5, True)]
+    assert sorted(claims.signers(digest)) == found
+    assert claims._store is before
+    monkeypatch.setattr(claims, "_process", -1)
+    assert sorted(claims.signers(digest)) == found
+    forked = claims._store
+    assert forked is not before
+    assert sorted(claims.signers(digest)) == found
+    assert claims._store is forked, "opened once"
+    forked.close()
+    monkeypatch.setattr(claims, "_store", before)
