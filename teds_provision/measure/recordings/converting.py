@@ -203,9 +203,12 @@ def _sweep(target: Path) -> None:
     if not OPENS_FOLDERS:  # without locks on folders, a running conversion cannot be recognized
         return
     name = re.compile(re.escape(f".{target.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
+    left = list[str]()
     with suppress(OSError):
-        for found in [file_name for file_name in os.listdir(target.parent) if name.fullmatch(file_name)]:
-            folder = target.with_name(found)
+        left = [file_name for file_name in os.listdir(target.parent) if name.fullmatch(file_name)]
+    for found in left:
+        folder = target.with_name(found)
+        with suppress(OSError):  # one that is held, or cannot be removed, keeps no other one
             held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | NOFOLLOW | CLOSING)
             try:
                 if is_mine(os.fstat(held)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from mcap.reader import make_reader
 
-from teds_provision.errors import UsageError
+from teds_provision.errors import StoreError, TedsProvisionError, UsageError
 from teds_provision.measure.blocks import Block, GroupRows, InvalidValues, NodeReport, Note
 from teds_provision.measure.recordings import converting
 from teds_provision.measure.recordings.converting import convert
@@ -353,3 +355,97 @@ def test_what_a_recording_holds_is_shown_whole() -> None:
     assert [empty[name] for name in ("from", "until", "lost", "nodes", "samples")] == [None, None, None, [], 0]
     alone = empty["channels"][-1]
     assert [alone[name] for name in names[4:]] == [None, None, 0, 0, None, None]
+
+
+FOLDER = "There is no folder"
+
+
+@pytest.mark.parametrize(
+    ("target", "wide", "code", "message", "hint"),
+    [
+        ("run.xml", False, 2, "Unsupported format: 'run.xml'.", "Use .csv, .txt, .jsonl, .mcap, .parquet."),
+        ("run", False, 2, "Unsupported format: 'run'.", "Use .csv, .txt, .jsonl, .mcap, .parquet."),
+        ("run.mcap", True, 2, "--wide only works with text files and Parquet.", "Name a FILE.csv or FILE.parquet."),
+        ("run.JSONL", True, 2, "--wide only works with text files and Parquet.", "Name a FILE.csv or FILE.parquet."),
+        ("taken.csv", False, 2, "already exists", ""),
+        ("none/run.csv", False, 3, FOLDER, "Create it, or choose another path."),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_anything_is_read(
+    tmp_path: Path, target: str, wide: bool, code: int, message: str, hint: str
+) -> None:
+    (tmp_path / "taken.csv").write_text("mine")
+    with pytest.raises(TedsProvisionError) as refused:
+        convert(tmp_path / "not there", tmp_path / target, wide=wide)
+    assert refused.value.exit_code == code
+    assert message in refused.value.message
+    assert hint in refused.value.hint
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.csv"]
+    assert (tmp_path / "taken.csv").read_text() == "mine"
+
+
+def test_the_suffix_counts_whatever_its_letters_are(tmp_path: Path) -> None:
+    first = recorded(tmp_path / "run.jsonl", [block()])
+    for name in ("A.CSV", "B.Parquet", "C.MCAP"):
+        assert convert(first, tmp_path / name).files == (tmp_path / name,)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_name_that_was_taken_during_the_conversion_is_not_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
+    """A file system without hard links gets the file by its new name, if that is still free."""
+    first = recorded(tmp_path / "run.jsonl", [block()])
+
+    def none(*_words: Any) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    if not links:
+        monkeypatch.setattr(converting.os, "link", none)
+    assert convert(first, tmp_path / "one.csv").files == (tmp_path / "one.csv",)
+    assert open_recording(tmp_path / "one.csv").facts
+    published = converting._published
+
+    def beside(path: Path, folder: Path) -> Path:
+        (folder / path.name).write_text("mine")
+        return published(path, folder)
+
+    monkeypatch.setattr(converting, "_published", beside)
+    with pytest.raises(UsageError, match=r"two\.csv already exists"):
+        convert(first, tmp_path / "two.csv")
+    assert (tmp_path / "two.csv").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.csv", "run.jsonl", "two.csv"]
+
+
+def test_a_disk_that_refuses_a_conversion_is_named_with_the_target(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = recorded(tmp_path / "run.jsonl", [block()])
+
+    def full(_folder: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(converting, "sync_folder", full)
+    with pytest.raises(StoreError) as refused:
+        convert(first, tmp_path / "one.csv")
+    assert refused.value.message == f"{tmp_path / 'one.csv'} cannot be written: the disk is full."
+
+
+def test_only_what_a_dead_conversion_to_this_name_left_is_removed(tmp_path: Path) -> None:
+    first = recorded(tmp_path / "run.jsonl", [block()])
+    dead, running, other, near = (
+        tmp_path / name
+        for name in (
+            f".one.csv.{'0' * 16}.teds-part", f".one.csv.{'1' * 16}.teds-part", f".two.csv.{'0' * 16}.teds-part",
+            ".one.csv.00.teds-part",
+        )
+    )  # fmt: skip
+    for folder in (dead, running, other, near):
+        folder.mkdir()
+        (folder / "one.csv").write_text("x")
+    held = os.open(running, os.O_RDONLY | os.O_DIRECTORY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    convert(first, tmp_path / "one.csv")
+    assert not dead.exists()
+    assert (running.exists(), other.exists(), near.exists()) == (True, True, True)
+    os.close(held)

@@ -1318,3 +1318,17 @@ def test_lines_of_a_grid_have_no_raw_value_and_null_where_a_value_is_missing() -
         json_events.as_line({"value": float("nan")})
     times = [json_events.iso(seconds) for seconds in (0.0, 1e300, float("nan"))]
     assert times == ["1970-01-01T00:00:00.000Z", "unknown", "unknown"]
+
+
+def test_a_recorder_that_has_nothing_to_do_looks_after_its_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Values go into the file and onto the disk although no more of them come."""
+    sink, looks = at_hand(tmp_path / "run.csv"), list[float]()
+    monkeypatch.setattr(sink.part, "look", looks.append)
+    for now in (5.0, 6.0):
+        sink._idle(now)
+    assert looks == [5.0, 6.0]
+    sink._finish()
+    sink._idle(7.0)
+    assert looks == [5.0, 6.0]

@@ -509,6 +509,18 @@ def test_a_namesake_that_joins_leaves_each_datasheet_under_the_name_that_its_nod
     assert list(sink.words) == [f"/bench/arm_{other[:8]}/teds", f"/bench/arm_{ARM[:8]}/teds"]
 
 
+def test_what_is_announced_anew_is_what_changed_and_every_channel_of_a_node_with_another_name() -> None:
+    second, other = replace(ANGLE, number=2, name="speed"), replace(ANGLE, uuid="f" * 20)
+    sink = carried([], facts=[ANGLE, second, FORCE], station=replace(STATION, nodes={}))
+    assert sink._learn((ANGLE, FORCE)) == []
+    warmer = replace(ANGLE, high=7.0)
+    assert sink._learn((warmer, second)) == [warmer]
+    assert sink._learn((other,)) == [other, warmer, second], "two nodes of one name: the first gets another one, too"
+    named = replace(other, chosen=((0, "left_arm"),))
+    assert sink._learn((named,))[0] == named
+    assert len(sink._learn((replace(named, low=0.5),))) == 1
+
+
 def test_an_unsigned_datasheet_is_reported_in_diagnostics_and_metadata() -> None:
     bare = ChannelFacts(ARM, "arm", 1, "angle", unsigned=True)
     sink = carried([block([[1]], [[np.nan]], [[False]])], facts=[bare, FORCE])

@@ -413,12 +413,14 @@ def test_under_another_name_of_their_node_all_channels_are_announced_anew_and_it
     first = [topic for topic, _ in client.published]
     assert first == [f"homeassistant/sensor/{ARM}/{number}/config" for number in (1, 2)]
     client.published.clear()
+    client.retained.clear()
     sink._process_item((ANGLE, other))
     assert client.published == [], "nothing is new"
     sink._process_item((replace(ANGLE, chosen=((0, "left"),)),))
     topics = [topic for topic, _ in client.published]
     assert topics == ["bench/arm/state", *first]
     assert client.published[0][1] == b""
+    assert client.retained[0], "an empty message removes a retained one only if it is retained itself"
     assert [json.loads(octets)["state_topic"] for _, octets in client.published[1:]] == ["bench/left"] * 2
 
 
