@@ -212,7 +212,7 @@ static void run_can_request(teds_node *node, teds_line *line, const uint8_t *bod
     teds_stored_reply *reply;
     if (is_sending(line)) { /* a new request shows that the station no longer wants the reply */
         finish_message(node, line);
-        if (line->source == 0 || line->own != own) {
+        if (line->own != own) {
             return; /* the node has moved, and the old address does not answer */
         }
     }

@@ -760,6 +760,45 @@ static void what_waits_to_leave_is_due_now(void)
     memory_free(board);
 }
 
+/* The same of what needs no line: a refusal to a station without one, and the Announce of a pressed button. */
+static void what_leaves_without_a_line_is_due_now(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    memory_at(board, now);
+    teds_can_pressed(&board->node, now);
+    CHECK(memory_poll(board) == now, "a press");
+    CHECK(out(board, &identifier, data) == 8 && data[6] == 1 && memory_poll(board) > now, "it leaves, once");
+    has_session(board, 0, 0xF1);
+    has_session(board, 1, 0xF2);
+    CHECK(is_answered(board, 0xF1) && is_answered(board, 0xF2), "two lines");
+    in(board, TO_NODE + 2, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "a third");
+    in(board, TO_NODE + 3, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && memory_poll(board) > now, "a fourth");
+    in(board, TO_NODE + 4, "\x07\x2c\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(memory_poll(board) == now, "a refusal");
+    CHECK(out(board, &identifier, data) == 8 && data[5] == 17 && memory_poll(board) > now, "it leaves, once");
+    memory_free(board);
+}
+
+/* An Announce that waited when the controller went off the bus is not sent at its return: teds_can_start plans another. */
+static void no_announce_from_before_a_bus_off_is_left(void)
+{
+    memory_board *board = fresh();
+    memory_at(board, now);
+    memory_can_start(board);
+    teds_can_pressed(&board->node, now);
+    teds_node_bus_off(&board->node);
+    now += 2000 * MS;
+    CHECK(silent(board), "nothing is left");
+    memory_can_start(board);
+    now += 500 * MS;
+    CHECK(!silent(board), "it announces itself");
+    memory_free(board);
+}
+
 /* The end of a silent session is due ten minutes after its last good frame: what it staged or claimed ends with it. */
 static void the_end_of_a_session_is_due(void)
 {
@@ -847,7 +886,8 @@ static void a_station_without_a_line_is_refused_in_its_form(void)
     for (int form = 0; form < 4; form++) {
         bool fd = form % 2 == 0;
         const bool asked = form % 2 != 0;
-        in(board, TO_NODE + 4, form < 2 ? "\x07\x2c\x00\x00\x80\x07\x00\x00" : "\x10\x64\x2c\x00\x00\x01\x03\x00", 8, asked);
+        in(board, TO_NODE + 4,
+           form < 2 ? "\x07\x2c\x00\x00\x80\x07\x00\x00" : "\x10\x64\x2c\x00\x00\x01\x03\x00", 8, asked);
         CHECK(memory_can_tx(board, &identifier, data, &fd) == 8 && data[5] == 17 && fd == asked, "17 in form %d", form);
     }
     memory_free(board);
@@ -937,6 +977,36 @@ static void a_reply_that_is_another_link_s_is_nobodys(void)
         CHECK(line->out_reply == NULL || line->out_reply->link == line->source, "the reply of station %02x", line->source);
     }
     memory_free(board);
+}
+
+/* Nor does a reader or a connection get what another link was answered, once that has the place of its reply. */
+static void a_reply_of_the_tag_and_of_the_air_goes_with_its_place(void)
+{
+    static const uint8_t identify[12] = {0, 5, 0, 6, 0, 0, 0, 0, 128, 7, 0, 0};
+    for (int air = 0; air < 2; air++) {
+        memory_board *board = fresh();
+        uint32_t identifier;
+        uint8_t data[512];
+        memory_at(board, now);
+        if (air) {
+            memory_ble_connected(board, 0, 247);
+            memory_ble_written(board, 0, identify, sizeof identify);
+        } else {
+            board->node.replies[0].used = true;
+            board->node.replies[0].link = TEDS_LINK_NFC;
+            board->node.replies[0].at = now;
+            board->node.nfc.reply = &board->node.replies[0];
+            board->node.nfc.answered = true;
+        }
+        for (uint8_t i = 0; i < TEDS_REPLIES; i++) {
+            now += MS;
+            in(board, TO_NODE + i, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+            CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "an answer begins");
+            CHECK(board->node.nfc.answered == (!air && i + 1 < TEDS_REPLIES), "the tag's, after %u", i + 1u);
+        }
+        CHECK(memory_ble_notify(board, 0, data) == 0, "nothing for the connection");
+        memory_free(board);
+    }
 }
 
 /* What Identify says changes while an answer to everyone is under way: it is not continued with other octets. */
@@ -1098,6 +1168,37 @@ static void forged_announces_move_a_node_less_and_less(void)
     memory_free(board);
 }
 
+/* A conflict, and a refusal that waits, are of the address at which they came. */
+static void what_waits_at_an_address_goes_with_it(void)
+{
+    static const char forged[] = "\x01\x00\x00\x00\x00\x01\x00\x00";
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    for (unsigned i = 0; i < 4; i++) {
+        in(board, 0x1CFF0000u | address_of(board), forged, 8, false);
+    }
+    CHECK(board->node.can.gives_up, "the fourth move waits for a second");
+    memory_move(board, 0x55);
+    now += 1500 * MS;
+    while (out(board, &identifier, data) >= 0) {
+    }
+    CHECK(address_of(board) == 0x55, "nobody claimed the new one: it is at %02x", address_of(board));
+    memory_free(board);
+    board = fresh();
+    has_session(board, 0, 0xF1);
+    has_session(board, 1, 0xF2);
+    CHECK(is_answered(board, 0xF1) && is_answered(board, 0xF2), "their lines");
+    in(board, TO_NODE + 2, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "a long question comes in");
+    in(board, TO_NODE + 3, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "an answer begins");
+    in(board, TO_NODE + 4, "\x07\x2c\x00\x00\x80\x07\x00\x00", 8, false);
+    memory_move(board, 0x55);
+    CHECK(silent(board), "who was refused at the old address hears nothing from the new one");
+    memory_free(board);
+}
+
 static void an_announce_that_is_none_moves_nobody(void)
 {
     static const struct {
@@ -1242,6 +1343,8 @@ int main(void)
     an_answer_to_everyone_gives_way();
     what_strangers_ask_takes_no_place_of_a_session();
     what_waits_to_leave_is_due_now();
+    what_leaves_without_a_line_is_due_now();
+    no_announce_from_before_a_bus_off_is_left();
     the_end_of_a_session_is_due();
     what_waits_for_its_station_is_wiped_after_a_minute();
     a_station_without_a_line_is_refused();
@@ -1249,6 +1352,7 @@ int main(void)
     a_long_request_that_gives_way_is_not_asked_on();
     one_station_does_not_hold_the_place_of_long_requests();
     a_reply_that_is_another_link_s_is_nobodys();
+    a_reply_of_the_tag_and_of_the_air_goes_with_its_place();
     an_answer_to_everyone_is_of_one_moment();
     everyone_waits_for_a_station_s_own_answer();
     who_asks_on_after_a_move_asks_nobody();
@@ -1256,6 +1360,7 @@ int main(void)
     a_move_waits_for_its_own_reply();
     a_chip_without_randomness_waits_by_its_uuid();
     forged_announces_move_a_node_less_and_less();
+    what_waits_at_an_address_goes_with_it();
     an_announce_that_is_none_moves_nobody();
     a_board_that_cannot_be_is_told_at_the_start();
     a_key_that_cannot_be_made_ahead_is_made_when_it_is_due();
