@@ -160,6 +160,22 @@ def test_the_moment_under_the_pointer_has_its_time_and_what_was_measured_then(st
     assert (text(stage, ".when"), text(stage, ".legend .figure")) == ("", "not valid")
 
 
+@pytest.mark.parametrize(
+    ("period", "silence", "gap"), [(0.1, 0.45, False), (0.1, 0.6, True), (2, 5.9, False), (2, 6.5, True)]
+)
+def test_a_live_curve_has_a_gap_where_three_values_and_half_a_second_are_missing(
+    stage: Stage, period: float, silence: float, gap: bool
+) -> None:
+    drawn(stage, "mm")
+    stage.run("state.rings.clear(); window.plot.pause(true); window.plot.paused = words[0]", NOW + 58)
+    times = [NOW + 35 + number * period for number in range(5)]
+    for some in (times, [times[-1] + silence, times[-1] + silence + period]):
+        stage.run("hub.take(words[0])", {"type": "values", "channels": {f"{ARM}/1": [some, [5] * len(some)]}})
+    stage.run("state.values.get(words[0]).period = words[1]", f"{ARM}/1", period)
+    stage.pass_time(100)
+    assert stage.run("return window.chart().data[1].includes(null)") is gap
+
+
 @pytest.mark.parametrize(("span", "digits"), [(10, 3), (30, 3), (117, 1), (600, 1), (3600, 0)])
 def test_the_moment_has_as_many_digits_as_its_column_is_wide(stage: Stage, span: int, digits: int) -> None:
     """59.98 s with one digit was 59.0 s, a second too early."""

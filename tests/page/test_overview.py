@@ -121,6 +121,32 @@ def test_what_is_open_beside_the_list_gives_way_to_what_is_chosen(stage: Stage) 
     assert texts(stage, heads) == ["hand"]
 
 
+def test_a_narrow_window_has_the_list_or_the_node_that_was_chosen_and_a_way_back(stage: Stage) -> None:
+    nodes(stage, gripper(), {"uuid": HAND, "name": "slew"})
+    stage.run("document.getElementById('main').className = 'view-nodes'")
+    seen = """
+      const shown = (where) => [...document.querySelectorAll(where)].filter((one) => one.checkVisibility());
+      return [shown(".side").length, shown(".detail h2").map((one) => one.innerText),
+        shown(".detail .back").map((one) => [one.innerText, one.getAttribute("href")])];
+    """
+    back = [["All nodes", "#/nodes"]]
+    try:
+        stage.page.set_viewport_size({"width": 899, "height": 900})
+        listing(stage)
+        assert stage.run(seen) == [1, [], []]
+        for rest, head in (([HAND], "slew"), (["update"], "Firmware update")):
+            stage.run("window.view.go(words)", *rest)
+            assert stage.run(seen) == [0, [head], back]
+        stage.run("window.view.go([])")
+        assert stage.run(seen) == [1, [], []]
+        stage.page.set_viewport_size({"width": 900, "height": 900})
+        stage.run("window.view.go([words[0]])", ARM)
+        assert stage.run(seen) == [1, ["hand"], []], "there is room for both"
+    finally:
+        stage.page.set_viewport_size({"width": 1280, "height": 900})
+        stage.run("document.getElementById('main').className = ''")
+
+
 def test_boards_of_an_update_are_those_selected_in_the_list(stage: Stage) -> None:
     nodes(stage, gripper(), {"uuid": HAND, "name": "slew"})
     listing(stage, "update")
