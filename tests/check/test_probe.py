@@ -199,6 +199,10 @@ def test_what_the_board_or_the_station_lacks_skips_a_rule_with_its_reason() -> N
         with pytest.raises(NotApplicableError) as no:
             lack()
         assert str(no.value) == words
+    probe, _ = probe_on(ok(IDENTITY.encode()))
+    assert probe.require(NodeState.FACTORY, NodeState.KEYED) == IDENTITY
+    probe.key, probe.credentials = bytes(16), cast("Any", "credentials")
+    assert (probe.link_key, cast("Any", probe.station)) == (bytes(16), "credentials")
     probe.no_session = "Open (128.3): …"
     with pytest.raises(NotApplicableError) as no:
         probe.open()
@@ -211,6 +215,7 @@ def _frames(*sources: tuple[str, int]) -> TraceRecorder:
     for direction, source in sources:
         recorder.frame("can", cast("Any", direction), b"", identifier=0x18DA0000 | source)
     recorder.frame("nfc", "in", b"")
+    recorder.frame("nfc", "out", b"")
     return recorder
 
 

@@ -5,6 +5,7 @@ Time stands still between the steps of a test, random waits are the longest, and
 
 from __future__ import annotations
 
+import functools
 import heapq
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -243,6 +244,60 @@ def test_what_looks_like_an_announce_and_is_none_moves_nobody(clock: list[float]
     for octets in ("0201000000000000", "01010000000000", "0103000000000000"):
         server.heard(0x1CFF0021, octets)
     assert node.address == 0x21
+
+
+def test_of_four_claims_the_fourth_is_given_way_to_a_second_later_once(clock: list[float]) -> None:
+    """Three moves at once; a claim that is repeated meanwhile changes nothing (profile.md, "CAN")."""
+    node = Node(uuid=HIGH)
+    server = Quiet(clock, node)
+    low = uuid_crc(LOW).to_bytes(4, "big").hex()
+    server.waits = True
+    for address in (0x21, 0x22, 0x23):
+        server.heard(0x18DA0000 | address << 8 | 0xF1, "1014010000010300")
+        assert len(server._active) == 1
+        server.heard(0x1CFF0000 | address, f"0101{low}0000")
+        assert (node.address, len(server._active)) == (address + 1, 0)
+    server.left()
+    for _ in range(3):
+        server.heard(0x1CFF0024, f"0101{low}0000")
+    assert len([job for *_, job in server._later if isinstance(job, functools.partial)]) == 1, "one move"
+    server.after(0.99)
+    assert node.address == 0x24
+    sent = server.after(0.02)
+    assert node.address == 0x25
+    assert sent == []
+    assert server.after(0.05) == [announce(node, address=0x25)]
+
+
+def test_a_move_that_waits_is_dropped_if_the_address_was_set_or_an_actuator_is_claimed(clock: list[float]) -> None:
+    low = uuid_crc(LOW).to_bytes(4, "big").hex()
+    for pinned in (False, True):
+        node = Node(uuid=HIGH)
+        server = Quiet(clock, node)
+        for address in (0x21, 0x22, 0x23, 0x24):
+            server.heard(0x1CFF0000 | address, f"0101{low}0000")
+        if pinned:
+            node.pinned = True
+        else:
+            server.heard(0x18DA24F1, "1008010000800a00")
+            server.heard(0x18DA24F1, "210144cccccccccc")
+        server.after(5)
+        assert node.address == (0x24 if pinned else 0x44)
+
+
+def test_an_echo_is_of_the_own_crc_and_a_claim_of_another_counts(clock: list[float]) -> None:
+    node = Node(uuid=HIGH)
+    server = Quiet(clock, node, options="?receive_own_messages=1")
+    server.heard(0x1CFF0021, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
+    assert node.address == 0x22
+
+
+def test_an_announce_that_left_meanwhile_does_not_leave_twice(clock: list[float]) -> None:
+    node = Node()
+    server = Quiet(clock, node)
+    server._addresses.announce_all()
+    server._addresses.announce_all()
+    assert server.after(1.0) == [announce(node)]
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,228 @@
+"""Readers of wrapped sensors step by step, without bus, device and sysfs: who gets a frame, how often a file is read.
+
+Devices, buffers and clocks are mocks; ``test_wrapped_dbc`` and ``test_wrapped_devices`` have real ones.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from teds_provision.links.can.sensor_bus import SensorFrame
+from teds_provision.node.wrapped import canopen_device, dbc_message, description, iio_reader, wrapped_source
+from teds_provision.node.wrapped.can_reader import CanReader
+from teds_provision.node.wrapped.dbc_message import FrameKey
+from teds_provision.node.wrapped.iio_reader import IioReader
+from teds_provision.node.wrapped.wrapped_source import WrappedSource
+
+
+def _reader(key: FrameKey, log: list[Any], name: str) -> Any:
+    return SimpleNamespace(message=SimpleNamespace(key=key), handle=lambda frame: log.append((name, frame.identifier)))
+
+
+def test_a_frame_goes_to_the_readers_of_its_identifier_and_of_its_j1939_group() -> None:
+    log: list[Any] = []
+    readers = [
+        _reader(FrameKey(0x100, False), log, "standard"),
+        _reader(FrameKey(0x100, True), log, "extended"),
+        _reader(FrameKey(0xFEF1, True, True), log, "group"),
+        _reader(FrameKey(0x18FEF100, True), log, "whole"),
+    ]
+    made = CanReader(cast("Any", None), readers, log.append)
+    for identifier, extended in ((0x100, False), (0x100, True), (0x18FEF1AA, True), (0x18FEF100, True), (0xFEF1, True)):
+        made._route(SensorFrame(identifier, extended, b"", 0.0))
+    assert log == [
+        ("standard", 0x100), ("extended", 0x100), ("group", 0x18FEF1AA), ("whole", 0x18FEF100), ("group", 0x18FEF100),
+    ]  # fmt: skip
+    alone = CanReader(cast("Any", None), readers[:2], log.append)
+    log.clear()
+    alone._route(SensorFrame(0x18FEF1AA, True, b"", 0.0))
+    assert log == []
+
+
+def test_ticks_of_a_node_are_held_against_the_clock_that_dates_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    def at(moment: float) -> tuple[None, str]:
+        asked.append(moment)
+        return None, ""
+
+    channel: Any = SimpleNamespace(at=at, channel=SimpleNamespace(name="torque"))
+    source = WrappedSource([channel], cast("Any", lambda *_: None))
+    monkeypatch.setattr(wrapped_source, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    source.start(cast("Any", SimpleNamespace(now=lambda: 30.0)))
+    assert source.at(1, 31.5) is None
+    assert source.at(2, 31.5) is None
+    assert asked == [1001.5]
+
+
+@pytest.mark.parametrize(
+    ("period", "slow", "waits"),
+    [
+        (0.5, 0.0, [0.0, 0.5, 0.5]),
+        (0.0001, 0.0, [0.0, 0.001, 0.001]),
+        (0.5, 0.2, [0.0, 0.3, 0.3]),
+        (0.5, 0.8, [0.0, 0.0, 0.0]),
+    ],
+)
+def test_files_are_read_once_a_period_and_lost_time_is_not_made_up_for(
+    monkeypatch: pytest.MonkeyPatch, period: float, slow: float, waits: list[float]
+) -> None:
+    """Each millisecond at most."""
+    clock, waited, read = [50.0], list[float](), list[Any]()
+
+    def wait(seconds: float) -> bool:
+        waited.append(seconds)
+        clock[0] += seconds
+        return len(waited) > 2
+
+    def read_file(channel: str, part: str) -> None:
+        read.append((channel, part))
+        clock[0] += slow
+
+    monkeypatch.setattr(iio_reader, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    rig = SimpleNamespace(
+        _device=SimpleNamespace(period=period),
+        _stop=SimpleNamespace(wait=wait),
+        _parts=[("x", 1)],
+        _read_file=read_file,
+    )
+    IioReader._poll(cast("Any", rig))
+    assert waited == pytest.approx(waits)
+    assert read == [("x", 1)] * 2
+
+
+class _Stop:
+    def __init__(self, rounds: int) -> None:
+        self.rounds, self.waits = rounds, list[float]()
+
+    def is_set(self) -> bool:
+        self.rounds -= 1
+        return self.rounds < 0
+
+    def wait(self, seconds: float) -> None:
+        self.waits.append(seconds)
+
+
+def _chunks(
+    rounds: int, monkeypatch: pytest.MonkeyPatch, *reads: bytes | OSError
+) -> tuple[list[bytes], list[str], _Stop]:
+    near, far = os.pipe()
+    os.write(far, b"x")  # it can be read
+    steps, troubles, stop = list(reads), list[str](), _Stop(rounds)
+
+    def read(_descriptor: int, most: int) -> bytes:
+        assert most == 65536
+        step = steps.pop(0)
+        if isinstance(step, OSError):
+            raise step
+        return step
+
+    monkeypatch.setattr(iio_reader, "os", SimpleNamespace(read=read))
+    rig = SimpleNamespace(_descriptor=near, _stop=stop, _trouble=troubles.append)
+    try:
+        return list(IioReader._chunks(cast("Any", rig), 4)), troubles, stop
+    finally:
+        os.close(near)
+        os.close(far)
+
+
+def test_whole_scans_of_a_buffer_come_as_they_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, troubles, _ = _chunks(4, monkeypatch, b"abc", BlockingIOError(), b"defghij", b"kl")
+    assert (found, troubles) == ([b"", b"abcdefgh", b"ijkl"], [])
+
+
+def test_a_buffer_that_fails_is_given_up_and_one_that_ended_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, troubles, stop = _chunks(3, monkeypatch, b"", b"abcd", OSError(errno.EIO, "Input/output error"))
+    assert (found, stop.waits) == ([b"abcd"], [0.2])
+    assert troubles == ["the buffer has ended", "the buffer cannot be read: Input/output error"]
+
+
+# -- descriptions ------------------------------------------------------------------------------------------------------
+
+
+def _signal(ids: list[int] | None, selector: str | None) -> Any:
+    return SimpleNamespace(multiplexer_ids=ids, multiplexer_signal=selector)
+
+
+def test_signals_of_another_selector_do_not_lengthen_the_turn() -> None:
+    signals = [_signal([0], "A"), _signal([1, 2], "A"), _signal([0, 1, 2, 3, 4], "B"), _signal(None, None)]
+    message: Any = SimpleNamespace(signals=signals)
+    assert [dbc_message._turns(message, signal) for signal in signals] == [3, 3, 5, 1]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "limits"),
+    [
+        (0, 0, (None, None)),
+        (1, 0, (None, None)),
+        (None, 5, (None, None)),
+        (0, None, (None, None)),
+        (-1, 2, (-1.0, 2.0)),
+    ],
+)
+def test_a_range_of_nothing_states_none(low: int | None, high: int | None, limits: tuple[Any, Any]) -> None:
+    assert dbc_message._limits(cast("Any", SimpleNamespace(minimum=low, maximum=high))) == limits
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        (None, 0),
+        (SimpleNamespace(default=5), 5),
+        (SimpleNamespace(default=5, value=7), 7),
+        (SimpleNamespace(default=5, value=None), 5),
+        (SimpleNamespace(default=5, value="text"), 5),
+        (SimpleNamespace(default=None), 0),
+        (SimpleNamespace(default="text", value=0), 0),
+    ],
+)
+def test_the_configured_value_of_a_dcf_goes_before_the_default(variable: Any, value: int) -> None:
+    objects: Any = SimpleNamespace(get_variable=lambda index, subindex: variable if (index, subindex) == (1, 2) else 9)
+    assert canopen_device._default(objects, 1, 2) == value
+
+
+def test_objects_of_one_name_are_told_apart_by_their_parents_or_their_index() -> None:
+    def variable(name: str, qualname: str, index: int, subindex: int) -> Any:
+        return SimpleNamespace(name=name, qualname=qualname, index=index, subindex=subindex)
+
+    found = [
+        variable("a", "a", 0x6000, 0), variable("b", "x.b", 0x6401, 1), variable("b", "y.b", 0x6402, 1),
+        variable("c", "z.c", 0x6ABC, 1), variable("c", "z.c", 0x6ABC, 2),
+    ]  # fmt: skip
+    names = [canopen_device._name(each, found) for each in found]
+    assert names == ["a", "x.b", "y.b", "z.c 6ABC.1", "z.c 6ABC.2"]
+
+
+@pytest.mark.parametrize(
+    ("name", "cut"),
+    [("a" * 121, "a" * 120), ("é" * 61, "é" * 60), ("a" * 119 + "é", "a" * 119), (" a\nb\x07 ", "a b")],
+)
+def test_a_name_of_a_teds_has_120_octets_and_no_half_letter(name: str, cut: str) -> None:
+    assert description._cut(name) == cut
+
+
+def test_a_buffer_that_may_not_be_used_leaves_its_elements_as_they_were(tmp_path: Path) -> None:
+    told: list[str] = []
+    (tmp_path / "scan_elements").mkdir()
+    (tmp_path / "buffer0").mkdir()
+    for name in ("scan_elements/in_x_en", "scan_elements/in_y_en", "buffer0/enable", "buffer0/length"):
+        (tmp_path / name).write_text("0")
+    device = SimpleNamespace(folder=tmp_path, character=tmp_path / "iio:device0", name="accel", period=0.01)
+    made: Any = IioReader.__new__(IioReader)
+    made._device, made._notify, made._enabled, made._descriptor = device, told.append, [], -1
+    channels: Any = [SimpleNamespace(name="x"), SimpleNamespace(name="y")]
+    assert made._open_buffer(channels) is False, "no character device"
+    (tmp_path / "iio:device0").mkdir()
+    made._enabled = []
+    (tmp_path / "scan_elements/in_y_en").unlink()
+    (tmp_path / "scan_elements/in_y_en").mkdir()
+    assert made._open_buffer(channels) is False
+    assert (tmp_path / "scan_elements/in_x_en").read_text() == "0"
+    assert told == ["The buffer of accel cannot be used (Is a directory): its files are read one by one."]
+    assert made._enabled == []
