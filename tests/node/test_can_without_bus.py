@@ -213,7 +213,7 @@ def test_two_nodes_of_one_process_that_meet_part(clock: list[float]) -> None:
     server._addresses.announce_all()
     first = server.after(0.5)
     assert announce(low, address=0x21) in first
-    assert (low.address, beside.address) == (0x21, 0x22)
+    assert (low.address, beside.address, server.told) == (0x21, 0x22, [])
     assert high.address == 0x23
     assert announce(high, address=0x23) in server.after(0.05)
     assert server.heard(0x18DA23F1, "0701" + WRITE) == ["18daf123 0401010000cccccc"]
@@ -230,12 +230,15 @@ def test_an_address_from_which_a_frame_came_is_in_use(clock: list[float], source
     assert node.address == (0x23 if taken else 0x22)
 
 
-def test_the_last_node_address_may_be_in_use_as_well(clock: list[float]) -> None:
-    node = Node(238, HIGH)
-    server = Quiet(clock, node)
-    server.heard(0x18DAF1EF, "0501000000")
-    server.heard(0x1CFF00EE, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
-    assert node.address == 1
+def test_the_last_and_the_first_node_address_may_be_in_use_as_well(clock: list[float]) -> None:
+    for source, moved in ((0xEF, 1), (0x01, 239)):
+        node = Node(238, HIGH)
+        server = Quiet(clock, node)
+        server.heard(0x18DAF100 | source, "0501000000")
+        server.heard(0x1CFF00EE, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
+        assert node.address == moved
+    server.heard(0x1CFF00EF, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
+    assert node.address == 2
 
 
 def test_what_looks_like_an_announce_and_is_none_moves_nobody(clock: list[float]) -> None:
@@ -267,6 +270,7 @@ def test_of_four_claims_the_fourth_is_given_way_to_a_second_later_once(clock: li
     assert node.address == 0x25
     assert sent == []
     assert server.after(0.05) == [announce(node, address=0x25)]
+    assert server.told == [], "another CRC is no conflict for a person"
 
 
 def test_a_move_that_waits_is_dropped_if_the_address_was_set_or_an_actuator_is_claimed(clock: list[float]) -> None:
@@ -430,8 +434,8 @@ def test_a_node_that_does_not_measure_hears_no_trigger_and_no_drive_frame(clock:
 def test_a_data_frame_leaves_for_a_node_of_this_bus_alone(clock: list[float]) -> None:
     node, other, beside = Node(), Node(0x22), Node(0x23, HIGH)
     server = Quiet(clock, node, beside)
-    server.send_data(cast("Any", node), 0x1CFE0024, b"data", fd=False)
-    assert server.left() == ["1cfe0024 64617461"]
+    server.send_data(cast("Any", node), 0x1CFE0025, b"data", fd=False)
+    assert server.left() == ["1cfe0025 64617461"]
     server.send_data(cast("Any", other), 0x1CFE0024, b"data", fd=False)
     server._stop.set()
     server.send_data(cast("Any", node), 0x1CFE0024, b"data", fd=False)
@@ -440,5 +444,6 @@ def test_a_data_frame_leaves_for_a_node_of_this_bus_alone(clock: list[float]) ->
     server.send_data(cast("Any", node), 0x1CFE0024, b"data", fd=False)
     assert server.left() == []
     server._bus = cast("Any", SimpleNamespace(send=server.sent.append))
-    server.heard(0x1CFF0023, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
-    assert beside.address == 0x25, "0x24 was heard from the other node of this process"
+    for address in (0x23, 0x24):
+        server.heard(0x1CFF0000 | address, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
+    assert beside.address == 0x26, "0x25 was heard from the other node of this process"
