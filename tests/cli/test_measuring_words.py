@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import signal
@@ -11,11 +12,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from rich.console import Console
 
-from teds_provision import measure
+from teds_provision import measure, provisioning
 from teds_provision.cli.context import App
 from teds_provision.cli.measure import measure as measure_command
 from teds_provision.cli.measure import sample as sample_command
@@ -527,3 +529,78 @@ def test_a_measurement_is_kept_as_it_was_asked_for(
     found |= {"rate": kept.rate, "require": kept.require}
     plain = {"group": None, "uuids": (UUID, OTHER), "actuators": True, "channels": (), "rate": None, "require": ""}
     assert found == plain | changes
+
+
+@pytest.mark.parametrize(
+    ("places", "via", "can", "ble"),
+    [
+        ((), "nfc", None, None),
+        (("can:socketcan:can0",), "can", ("socketcan:can0",), None),
+        (("can:socketcan:can0", "can:socketcan:can1"), "can", ("socketcan:can0", "socketcan:can1"), None),
+        (("ble:hci0",), "ble", None, "hci0"),
+        (("can:socketcan:can0", "ble:hci0"), "nfc", None, None),
+    ],
+)
+def test_nodes_are_met_where_they_were_last_unless_they_were_on_links_of_two_kinds(
+    places: tuple[str, ...], via: str, can: Any, ble: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(provisioning.meeting, "likely_places", lambda _station, _links, uuids: places if uuids else ())
+    links = sample_command.where_met(cast("Any", None), LinkSettings("nfc", timeout=7.0), [UUID])
+    assert (links.via, links.can, links.ble, links.timeout) == (via, can, ble, 7.0)
+
+
+def test_the_charge_is_that_of_the_tap_else_the_last_report() -> None:
+    known: dict[bytes, Any] = {}
+    station: Any = SimpleNamespace(nodes=SimpleNamespace(get=known.get))
+    node: Any = SimpleNamespace(uuid=UUID, contact=SimpleNamespace(charging=None))
+    assert sample_command._charging(station, node) is None
+    known[UUID] = SimpleNamespace(charging=None)
+    assert sample_command._charging(station, node) is None
+    known[UUID] = SimpleNamespace(charging='{"text": "charging", "at": "2026-01-31T10:00:00Z"}')
+    assert sample_command._charging(station, node) == {"text": "charging", "at": "2026-01-31T10:00:00Z"}
+    node.contact.charging = SimpleNamespace(to_json=lambda: {"text": "full"})
+    assert sample_command._charging(station, node) == {"text": "full"}
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "value", "shown"),
+    [
+        (-1.0, 1.0, 1.1e-9, "1.1e-09 mm"), (-1.0, 1.0, 0.9e-9, "0 mm"), (-1.0, 1.0, -0.9e-9, "0 mm"),
+        (-10.0, 1.0, 5e-9, "0 mm"), (0.0, 1.0, 5e-9, "5e-09 mm"), (0.0, math.inf, 1e-12, "1e-12 mm"),
+        (-math.inf, 1.0, -1e-12, "-1e-12 mm"), (0.0, 0.0, 0.0, "0 mm"),
+    ],
+)  # fmt: skip
+def test_a_set_point_that_is_zero_but_for_rounding_is_shown_as_zero(
+    low: float, high: float, value: float, shown: str
+) -> None:
+    channel: Any = SimpleNamespace(low=low, high=high)
+    applied: Any = SimpleNamespace(value=value, unit="mm")
+    assert sample_command._near(channel, applied) == shown
+    bare: Any = SimpleNamespace(value=value, unit="")
+    assert sample_command._near(channel, bare) == shown.removesuffix(" mm")
+
+
+@pytest.mark.parametrize(("level", "shown"), [(None, ""), (0, "Battery 0 %"), (77, "Battery 77 %")])
+def test_a_battery_is_shown_if_the_node_has_one(level: int | None, shown: str) -> None:
+    found: Any = SimpleNamespace(measuring=False, channels={})
+    for power in (None, SimpleNamespace(level=level)):
+        console = Console(file=io.StringIO())
+        sample_command._mode(console, found, {}, cast("Any", power))
+        last = console.file.getvalue().splitlines()[-1]  # type: ignore[attr-defined]
+        assert (last == shown) is (bool(shown) and power is not None)
+
+
+def test_a_terminal_that_is_closed_ends_in_order_unless_that_is_ignored() -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    try:
+        for handler, handled in ((signal.SIG_DFL, True), (signal.SIG_IGN, False)):
+            signal.signal(signal.SIGHUP, handler)
+            stop = IdleStop(None)
+            with sample_command.ending(stop):
+                assert (signal.getsignal(signal.SIGHUP) != handler) is handled
+                signal.raise_signal(signal.SIGHUP)
+                signal.raise_signal(signal.SIGHUP)
+                assert stop.is_set() is handled
+            assert signal.getsignal(signal.SIGHUP) == handler
+    finally:
+        signal.signal(signal.SIGHUP, before)
