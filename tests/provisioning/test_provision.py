@@ -18,6 +18,7 @@ from teds_provision.errors import (
     NotAuthenticError,
     NotWhitelistedError,
     PolicyError,
+    StoreError,
     TedsProvisionError,
 )
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, TedsFunction
@@ -33,6 +34,7 @@ from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
+from teds_provision.station.store.records import NodeRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
@@ -445,3 +447,198 @@ def test_a_board_that_is_only_verified_is_judged_checked_and_reported_to_its_lin
         [entry] = logged
         assert (entry.uuid, entry.outcome, entry.detail["step"]) == (board.uuid, "wrong-board", "verify")
         assert entry.detail["why"] == last[3].message
+
+
+# -- the order of the steps, without a board ---------------------------------------------------------------------------
+
+
+def a_run(station: Station, *, line: Any = None, onward: Any = None, operator: Any = None) -> Any:
+    """Return a run with a node that is no more than a name."""
+    node: Any = SimpleNamespace(uuid=bytes(10), leave=lambda: None)
+    accepting = operator or Answers(accept=accept)
+    return provision_module._Run(station, node, BuildOrder(), accepting, SilentReporter(), line=line, onward=onward)
+
+
+@pytest.mark.parametrize(
+    ("state", "with_line", "typed", "demanded", "recalled", "begins"),
+    [
+        (NodeState.FACTORY, False, True, False, False, ["its board"]),
+        (NodeState.PROVISIONED, False, True, False, False, []),
+        (NodeState.PROVISIONED, True, True, False, False, ["its board"]),
+        (NodeState.FACTORY, False, False, False, True, []),
+        (NodeState.PROVISIONED, False, True, True, True, ["firmware plain"]),
+        (NodeState.FACTORY, True, True, True, False, ["its board", "firmware plain"]),
+    ],
+)
+def test_what_is_looked_at_before_a_board_is_keyed_and_what_a_run_returns(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    state: NodeState,
+    with_line: bool,
+    typed: bool,
+    demanded: bool,
+    recalled: bool,
+    begins: list[str],
+) -> None:
+    course: list[Any] = []
+    prepared = PreparedOrder(BuildOrder(), load_profile("gripper") if typed else None)
+    of_unit = replace(prepared, warnings=("of the unit",))
+    unit: Any = SimpleNamespace(prepared=of_unit)
+    line = SimpleNamespace(allot_unit=lambda *_: (course.append("unit"), unit)[1]) if with_line else None
+    run = a_run(station, line=line, onward=lambda _node: course.append("onward"))
+    who: Any = SimpleNamespace(uuid=bytes(10), state=state, recalled=recalled, security_teds=b"shown")
+    present = SimpleNamespace(image=SimpleNamespace(blocks={"old": 1}))
+    proposal = SimpleNamespace(warnings=("proposed",), image="new", calibrations="calibrations")
+    borne = HardwareCheck({1: True}, ({"channel": 1},), ("hardware",))
+    module = provision_module
+    readings = iter(["plain", "sealed"] if demanded else ["sealed"])
+    demand: Any = "demand" if demanded else None
+    monkeypatch.setattr(module, "shown_by", lambda _node, numbers: sorted(numbers))
+    monkeypatch.setattr(module, "differences", lambda shown, *_: tuple(map(str, shown)))
+    monkeypatch.setattr(module, "read_firmware", lambda _node: next(readings))
+    monkeypatch.setattr(
+        module, "require_firmware", lambda _uuid, wanted, found: course.append(f"firmware {found}" if wanted else "any")
+    )
+    monkeypatch.setattr(module, "take_snapshot", lambda _node, *, initial: (course.append(initial), present)[1])
+    monkeypatch.setattr(module, "further", lambda has, _image: (f"further {list(has)}",))
+    monkeypatch.setattr(module, "certificate_brought", lambda calibrations: f"of {calibrations}")
+    run._prepared = lambda _who: prepared
+    run._firmware_demand = lambda *_: demand
+    run._require_its_board = lambda _who, _prepared, changes: course.append("its board") if changes else None
+    run._whitelist = lambda _who: (course.append("whitelist"), "entry")[1]
+    run._agree = lambda _who, entry: course.append(f"agree {entry}")
+    run._build = lambda _who, order, _present: (course.append(("build", order.warnings)), proposal)[1]
+    run._sign = lambda *_: "signed"
+    run._write = lambda signed, *_: SimpleNamespace(on_node=f"{signed} and written")
+    run._verify = lambda _who, written: f"verified {written.on_node}"
+    run._check = lambda order, *_: (course.append(("check", order.warnings)), borne)[1]
+    done = run.run(who)
+    order = ("of the unit",) if with_line else ()
+    assert course == [
+        *begins,
+        "whitelist",
+        *(["unit"] if with_line else []),
+        "agree entry",
+        "onward",
+        "firmware sealed" if demanded else "any",
+        None if recalled else b"shown",
+        ("build", order),
+        ("check", order),
+    ]
+    assert done.warnings == ("proposed", "further ['old']", "hardware")
+    assert (done.image, done.verified) == ("signed and written", "verified signed and written")
+    assert (done.samples, done.certificate, done.firmware) == (({"channel": 1},), "of calibrations", "sealed")
+
+
+@pytest.mark.parametrize(
+    ("changes", "retype", "remembered", "asked"),
+    [
+        ((), False, False, 0),
+        (("in N",), True, False, 0),
+        (("in N",), False, True, 0),
+        (("in N",), False, False, 1),
+    ],
+)
+def test_a_board_of_another_type_is_asked_about_once(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    changes: tuple[str, ...],
+    retype: bool,
+    remembered: bool,
+    asked: int,
+) -> None:
+    questions: list[Any] = []
+    operator: Any = SimpleNamespace(retype=lambda uuid, differences: questions.append((uuid, differences)))
+    states: list[bool] = []
+
+    def known(_station: Station, _uuid: bytes, wanted: str | None, *, factory: bool) -> bool:
+        assert wanted == "gripper"
+        states.append(factory)
+        return remembered
+
+    monkeypatch.setattr(provision_module, "is_remembered", known)
+    run = a_run(station, operator=operator)
+    prepared = PreparedOrder(BuildOrder(profile="gripper", retype=retype))
+    for state in (NodeState.FACTORY, NodeState.PROVISIONED):
+        run._require_its_board(SimpleNamespace(uuid=bytes(10), state=state), prepared, changes)
+    assert questions == [(bytes(10), changes)] * asked
+    assert states == ([True] if asked else [True, False] if remembered else [])
+
+
+def test_the_firmware_of_a_board_is_that_which_its_new_or_known_type_demands(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, who = a_run(station), cast(Any, SimpleNamespace(uuid=bytes(10)))
+    monkeypatch.setattr(
+        provision_module, "FirmwareDemands", lambda _home: SimpleNamespace(demand_of=lambda profile: f"of {profile}")
+    )
+    typed: Any = SimpleNamespace(profile=SimpleNamespace(firmware="of the new type"))
+    assert run._firmware_demand(who, typed) == "of the new type"
+    untyped = PreparedOrder(BuildOrder())
+    assert run._firmware_demand(who, untyped) == "of None"
+    with station.transaction():
+        station.nodes.put(NodeRecord(bytes(10), profile="gripper"))
+    assert run._firmware_demand(who, untyped) == "of gripper"
+
+
+@pytest.mark.parametrize("outcome", ["good", "refused", "lost"])
+@pytest.mark.parametrize("with_unit", [True, False])
+def test_a_unit_gets_the_proof_or_the_cause_and_only_a_good_run_leaves_the_node(
+    station: Station, outcome: str, with_unit: bool
+) -> None:
+    course: list[Any] = []
+    cause = NodeSilentError("It is silent.")
+    errors = {"refused": PolicyError("No."), "lost": SessionLostError(cause), "good": None}
+    run = a_run(station)
+    who: Any = SimpleNamespace(uuid=bytes(10))
+    run.node.leave = lambda: course.append("leave")
+    run.unit = SimpleNamespace(
+        ended=lambda _node, done: course.append(done),
+        failed=lambda _node, one, _done, step, error: course.append((one, step, error)),
+    ) if with_unit else None  # fmt: skip
+
+    def work(_who: Any) -> str:
+        if (error := errors[outcome]) is not None:
+            raise error
+        return "done"
+
+    run._identify, run.run = lambda: who, work
+    if outcome == "good":
+        assert run.proven() == "done"
+        assert course == [*(["done"] if with_unit else []), "leave"]
+        return
+    with pytest.raises((PolicyError, SessionLostError)):
+        run.proven()
+    reason = cause if outcome == "lost" else errors["refused"]
+    assert course == ([(who, run.steps.current, reason)] if with_unit else [])
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_a_failure_is_in_the_log_with_its_step_unless_the_disk_is_full(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, full: bool
+) -> None:
+    seen: list[bool] = []
+
+    @contextmanager
+    def released(_uuid: bytes, what: str) -> Iterator[str]:
+        assert what == "provision"
+        yield "let go"
+
+    def proven(run: Any) -> Any:
+        seen.append(run.released)
+        run.steps.current = "sign"
+        raise PolicyError("It may not.")
+
+    def audit(*_: Any, **__: Any) -> None:
+        raise StoreError("The disk is full.")
+
+    station.released = released
+    monkeypatch.setattr(provision_module._Run, "proven", proven)
+    if full:
+        monkeypatch.setattr(type(station), "audit", audit)
+    with pytest.raises(PolicyError, match="It may not"):
+        run(station, board)
+    assert seen == [True]
+    if not full:
+        [entry] = [entry for entry in station.audit_log.entries() if entry.act == "provision"]
+        assert (entry.outcome, entry.detail) == ("refused", {"step": "sign", "why": "It may not."})
