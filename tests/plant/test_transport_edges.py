@@ -7,6 +7,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +34,7 @@ from teds_provision.plant import (
     fetching,
     jobs,
     membership,
+    owner,
     parcels,
     postgres,
     removed_members,
@@ -898,3 +900,63 @@ def test_a_folder_that_becomes_a_database_is_listened_to(station: Station, monke
     watch._listen()
     assert done == [service.EVERY, "listen", "sweep", "wait"]
     assert watch._wake.is_set()
+
+
+# -- pages that others handed in ---------------------------------------------------------------------------------------
+
+
+def test_own_pages_are_taken_from_who_handed_in_none_that_is_false(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a member that handed in one false page, no further one is read; those that are known are not asked for."""
+    me = station.fingerprint
+    pages = [(3, "liar", "h3"), (1, "liar", "false"), (2, "west", "h2"), (4, "west", "known"), (5, "", "mine")]
+    offers = [stub(n=n, by=by, hash=hash) for n, by, hash in pages]
+    read = list[str]()
+
+    def octets(batch: Any) -> Iterator[Any]:
+        yield from (stub(by=offer.by, hash=offer.hash) for offer in batch)
+
+    def read_pages(carried: Any, _roster: Any, of: str) -> tuple[list[Any], list[int]]:
+        [one] = carried
+        assert of == me
+        read.append(one.hash)
+        return ([], [1]) if one.hash == "false" else ([one], [])
+
+    database: Any = stub(
+        was_handed_in=lambda of: of == me, offers=lambda of: offers if of == me else [], octets=octets
+    )  # fmt: skip
+    new = [False]
+    monkeypatch.setattr(returned, "read_pages", read_pages)
+    monkeypatch.setattr(returned, "is_new", lambda *_: new[0])
+
+    def own(*, always: bool = False) -> list[str]:
+        read.clear()
+        found = returned.own_pages(station, database, cast("Any", None), {"known"}, always=always)
+        return [page.hash for page in found]
+
+    assert (own(), read) == ([], [])
+    assert (own(always=True), read) == (["h2"], ["false", "h2"])
+    new[0] = True
+    assert (own(), read) == (["h2"], ["false", "h2"])
+    database.was_handed_in = lambda _: False
+    assert own(always=True) == []
+    assert returned.own_pages(station, None, cast("Any", None), (), always=True) == []
+
+
+def test_who_is_in_no_roster_joins_none(station: Station) -> None:
+    held = station.plant.roster
+    assert held is not None
+    with pytest.raises(PolicyError) as error:
+        owner.join(station, replace(held, members=()), url=None, events=())
+    assert (error.value.message, error.value.hint) == (
+        "The roster of plant does not name this station.",
+        "Send its owner a request (registry request --output FILE); the owner then runs: registry add FILE --role …",
+    )
+    events = [("closed", None, {"job": "11111111-2222-4333-8444-555555555555"})]
+    assert owner.join(station, held, url="file:/stick", events=cast("Any", events)) == 1
+    record = station.plant.joined
+    assert record is not None
+    assert (record.url, len(station.plant.outbox(9))) == ("file:/stick", 1)
+    [entry] = [entry for entry in station.audit_log.entries() if (entry.act, entry.outcome) == ("registry", "joined")]
+    assert (entry.detail["version"], entry.detail["events"]) == (1, 1)

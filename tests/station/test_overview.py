@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from teds_provision.station import overview
+from teds_provision.station.datasheets import packed
 from teds_provision.station.overview import Search
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import (
@@ -116,6 +118,26 @@ def test_what_is_known_of_a_node_in_its_order(fleet: Station) -> None:
     )
     assert moved.moved == {"to_fingerprint": "ab" * 32, "handover_id": "h"}
     assert revoked.revoked == {"why": "lost", "created": AT}
+
+
+def test_what_a_node_wraps_is_read_from_its_last_datasheet_and_damage_is_passed_over(
+    fleet: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(overview, "origin_of", lambda blocks: blocks.get((0, 1), b"").decode() or None)
+    listed = {1: overview._ORIGIN, 2: overview._ORIGIN, 3: b"another", 5: overview._ORIGIN, 6: overview._ORIGIN}
+    for number, digests in listed.items():
+        fleet._store.execute(
+            "INSERT INTO readings(uuid, at, by, whole, digests, checks) VALUES(?, '', '', 1, ?, '[]')",
+            (uuid(number), digests),
+        )
+    for number, blocks in ((1, b"older"), (1, b"newest"), (2, b"\xff damaged"), (3, b"not listed"), (6, b"")):
+        octets = b"junk" if number == 2 else packed(Image(uuid(number), {(0, 1): blocks} if blocks else {}))
+        fleet._store.execute(
+            "INSERT INTO datasheets(uuid, sequence, epoch, seen, digest, blocks) VALUES(?, 1, 1, '', zeroblob(32), ?)",
+            (uuid(number), octets),
+        )
+    found = fleet.overview.nodes([uuid(number) for number in (1, 2, 3, 5, 6)])
+    assert [node.origin for node in found] == ["newest", None, None, None, None]
 
 
 def test_who_waits_for_a_person(fleet: Station) -> None:
