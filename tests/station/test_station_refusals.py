@@ -24,6 +24,7 @@ from teds_provision.errors import (
     UsageError,
     VaultChangedError,
     VaultError,
+    VaultLockedError,
 )
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.station import measurements, snapshot
@@ -536,3 +537,47 @@ def test_signers_are_read_in_a_fork_by_a_connection_of_its_own(
     assert claims._store is forked, "opened once"
     forked.close()
     monkeypatch.setattr(claims, "_store", before)
+
+
+def test_a_changed_vault_is_read_again_and_nobody_is_asked(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    adopted, asked = list[str](), list[Any]()
+    changed = VaultChangedError("another passphrase")
+
+    def vault(reread: Exception | None, *masters: int) -> Any:
+        return SimpleNamespace(reread=raises(reread) if reread else lambda: None, masters=lambda: masters)
+
+    def open_vault(home: Path, id: str, keystore: str, ask: Any, *, use_agent: bool) -> Any:
+        asked.append((home, id, keystore, use_agent))
+        with pytest.raises(VaultError):  # whoever is asked here raises
+            ask("Passphrase", False)
+        if opened is None:
+            raise VaultError("nothing holds it open")
+        return opened
+
+    def reopened(held: Any) -> Any:
+        monkeypatch.setattr(station, "_opened", lambda: held)
+        return station._reopened()
+
+    monkeypatch.setattr(type(station.identity), "master", 2)
+    monkeypatch.setattr(stations.selection, "open_vault", open_vault)
+    monkeypatch.setattr(station, "adopt", adopted.append)
+    opened: Any = None
+    good, handed, stale = vault(None), vault(changed, 1, 2), vault(changed, 1)
+    assert reopened(good) is good
+    assert reopened(handed) is handed, "the command that made the new key handed it over"
+    assert asked == []
+    with pytest.raises(VaultLockedError) as error:
+        reopened(stale)
+    assert (error.value.message, error.value.hint) == (
+        "The vault's passphrase and master key were changed by another command.",
+        "To let a running ncap continue: teds-provision unlock. Start any other command again.",
+    )
+    assert asked == [(station.home, station.id, station.identity.keystore, True)]
+    opened = "a vault that is held open"
+    assert reopened(stale) == opened
+    assert adopted == [opened]
+    assert len(asked) == 2
+    monkeypatch.setattr(station, "_reopened", lambda: "reopened")
+    for held, found in ((handed, handed), (stale, "reopened")):
+        monkeypatch.setattr(station, "_opened", lambda held=held: held)
+        assert cast("Any", station.current_vault()) is found
