@@ -243,19 +243,21 @@ static int run_reset(teds_node *node, const teds_command *command, teds_origin *
 
 static int run_set_can_address(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_state state = node->state;
     uint64_t now = teds_now(node);
-    int failed;
     (void)out;
     if (command->payload[0] == 0 || command->payload[0] > TEDS_LAST_ADDRESS) {
         return -TEDS_BAD_FORM;
     }
-    if (command->payload[0] != state.address) {
+    if (command->payload[0] != node->state.address) {
+        teds_state state;
+        int failed;
         if (now < node->address_again) {
             return -TEDS_BUSY;
         }
+        state = node->state;
         state.address = command->payload[0];
         failed = teds_slots_write(node, &state, NULL);
+        teds_wipe(&state, sizeof state);
         if (failed) {
             return failed;
         }
