@@ -303,8 +303,6 @@ def _compound(text: str) -> WrittenUnit | None:
             return None
         units = Units() if name == "1" else NAMED[name if named is None else named[0]]
         power = side * Fraction(match["power"] or (match["upper"] or "1").translate(_UPPER))
-        if units.interpretation != PRODUCT:
-            return None
         for base in UNIT_PARTS:
             out[base] += power * getattr(units, base)
         if named is not None:  # without its offset: in a product, a temperature is a difference
@@ -316,7 +314,8 @@ def _compound(text: str) -> WrittenUnit | None:
 def _factors(text: str) -> list[tuple[re.Match[str], int]] | None:
     """Return each factor of a product with its side (1 above, -1 below); None if it is no product."""
     upper, slash, lower = text.partition("/(")
-    if slash and (not lower.endswith(")") or "/" in lower):  # only one denominator in brackets, at the end
+    # only one denominator in brackets, at the end, and something on either side of the stroke
+    if slash and (not upper or lower == ")" or not lower.endswith(")") or "/" in lower):
         return None
     factors: list[tuple[re.Match[str], int]] = []
     for part, side in ((upper, 1), (lower[:-1], -1)) if slash else ((upper, 1),):

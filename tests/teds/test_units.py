@@ -130,8 +130,20 @@ def test_products_of_the_table_agree_with_pint(form: str) -> None:
 
 @pytest.mark.parametrize("text", ["N/mm", "kg/m**3", "W/(m*K)", "1/K", "degC/min", "m/s³"])
 def test_products_need_no_pint(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    u.parse_unit.cache_clear()  # what pint has parsed before would be found
     monkeypatch.setattr(u, "_registry", lambda: None)
     assert u.parse_unit(text).units.interpretation == u.PRODUCT
+
+
+@pytest.mark.parametrize(
+    "text", ["W/(m", "W/(m*", "W/()", "W/( )", "/(m)", "W/(m/", "W/m)", "/m", "*m", "m*", "W//m", "W/(m*K)*s"]
+)
+def test_half_a_product_is_no_unit(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    u.parse_unit.cache_clear()
+    monkeypatch.setattr(u, "_registry", lambda: None)
+    with pytest.raises(BadDataError) as refused:
+        u.parse_unit(text)
+    assert refused.value.message.startswith(f'"{text}" is not a unit')
 
 
 @pytest.mark.parametrize("text", ["dB/m", "m*dB", "bit/s", "ratio*m", "strain/s", "N/percent"])

@@ -497,3 +497,22 @@ def test_a_trace_beyond_its_bound_is_not_read(tmp_path: Path, monkeypatch: pytes
         )
     else:
         assert len(list(read_trace(tmp_path / "t"))) == 1
+
+
+def test_blocks_that_are_no_packets_are_passed_over() -> None:
+    """Names, statistics and what other programs add, whatever is in them; the last block may have no body."""
+    frame = packet(0, 1_500_000, b"\x98\xda\x21\xf1\1\0\0\0\1", OUT + END)
+    others = le_block(4, bytes(40)) + le_block(5, b"\xff" * 40) + le_block(0x0BAD, frame[8:-4])
+    found = list(
+        pcapng.read_pcapng(pcapng.head() + others + frame + le_block(0x80000001, b"") + frame + le_block(3, b""))
+    )
+    assert [(record.direction, record.octets) for record in found] == [("out", b"\1")] * 2
+
+
+@pytest.mark.parametrize("length", [0, 8, 11, 13, 14, 30])
+def test_a_block_of_an_impossible_length_is_named_with_its_place(length: int) -> None:
+    """At least its own twelve octets, and a multiple of four: else a reader would go astray, or stand still."""
+    head = pcapng.head()
+    with pytest.raises(BadDataError) as refused:
+        list(pcapng.read_pcapng(head + le(6, length) + bytes(60)))
+    assert refused.value.message == f"The pcapng block at octet {len(head)} says it has {length} octets."

@@ -94,4 +94,10 @@ def test_a_system_that_does_not_name_the_peer_of_a_socket_receives_nothing(
     monkeypatch.delattr(socket, "SO_PEERCRED")
     with master_socket.MasterSocket(tmp_path, lambda _: True):
         assert list(tmp_path.iterdir()) == []
-        assert master_socket.hand_over(tmp_path, MasterKeys.generate()) is None
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other,
+        short_path(tmp_path / master_socket.SOCKET) as name,
+    ):
+        other.bind(name)
+        other.listen()
+        assert master_socket.hand_over(tmp_path, MasterKeys.generate()) is None, "nor is anything given to a listener"
