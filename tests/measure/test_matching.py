@@ -333,3 +333,15 @@ class _Guard:
     def __enter__(self) -> None: ...
 
     def __exit__(self, *_: object) -> None: ...
+
+
+def test_a_type_is_named_and_never_the_path_of_a_file(tmp_path: Path) -> None:
+    """The expression of a measurement may come from another machine: no file of its choice is read."""
+    assert matching._profile("gripper", tmp_path) == load_profile("gripper")
+    for folder in (tmp_path, tmp_path / "profiles"):
+        folder.mkdir(exist_ok=True)
+        (folder / "mine.toml").write_text('extends = "gripper"\nname = "mine"\n')
+    for kind in (str(tmp_path / "mine.toml"), "../mine", "mine.toml", "no-such-type"):
+        assert matching._profile(kind, tmp_path) is None, kind
+    (tmp_path / "profiles" / "broken.toml").write_text("[[")
+    assert matching._profile("broken", tmp_path) is None

@@ -197,6 +197,7 @@ def test_a_child_that_starts_is_called_as_the_measurement_and_no_longer_waits_fo
     [(command, more)] = began
     assert (command[0], command[-1]) == ("/usr/bin/python3", "teds_provision_bench_left_arm_77")
     assert (more["env"]["ROS_MASTER_URI"], more["start_new_session"]) == ("http://lab:11311", True)
+    assert [more[pipe] for pipe in ("stdin", "stdout", "stderr")] == [-1] * 3, "what it complains of is heard"
     assert (sink.stats.state, sink.stats.detail, sink._numbers) == ("waiting", "rospy is starting", {})
     assert sink._child is not None
     assert sink._child.stdin is not None

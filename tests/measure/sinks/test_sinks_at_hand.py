@@ -10,12 +10,14 @@ import pytest
 
 from teds_provision.describe.asset_shell import asset_shell
 from teds_provision.errors import TedsProvisionError, UsageError
+from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.sinks.base import ThreadedSink
 from teds_provision.measure.sinks.foxglove_server import FoxgloveServer, MeasurementTopics, _listener
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros import child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
-from tests.measure.sinks.parts import STATION
+from tests.measure.sinks.parts import ARM, STATION, block
 
 NONE: Any = None
 
@@ -185,3 +187,120 @@ def test_set_points_of_ros_2_go_to_their_channel_or_to_the_joints_that_they_name
     assert heard == [("aa", 3, 1.5), (["a"], [1.0], [2.0], [3.0]), ("", 0, 2.5)]
     assert len(attached) == len(sink._attached) == 2, "each reader once"
     assert paused == [0.2]
+
+
+def test_a_topic_of_set_points_is_read_once_by_whoever_publishes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Best effort, as a reader that asks for less than is offered hears every writer; one thread hears all topics."""
+    sub = pytest.importorskip("cyclonedds.sub")
+    sink = Ros2Sink("ros2:7")
+    readers: list[Any] = []
+    started: list[Any] = []
+    monkeypatch.setattr(
+        sub, "DataReader", lambda _participant, topic, *, qos: readers.append((topic, qos)) or len(readers)
+    )
+    monkeypatch.setattr(sink, "_topic", lambda kind, name: (kind, name))
+    monkeypatch.setattr(sink, "_qos", lambda kind, *, latched, reading=False: (kind, latched, reading))
+    thread = lambda target, name, daemon: SimpleNamespace(start=lambda: started.append((target, daemon)))  # noqa: E731
+    monkeypatch.setattr("teds_provision.measure.sinks.ros.ros2.threading", SimpleNamespace(Thread=thread))
+    for _ in range(2):
+        sink._listen("/arm/grip/command", "aa", 3)
+        sink._listen_joints("/bench/joint_commands")
+    double, joints = "std_msgs/Float64", "sensor_msgs/JointState"
+    assert readers == [
+        ((double, "rt/arm/grip/command"), (double, False, True)),
+        ((joints, "rt/bench/joint_commands"), (joints, False, True)),
+    ]
+    assert sink._readers == {"/arm/grip/command": (1, "aa", 3), "/bench/joint_commands": (2, "", 0)}
+    assert started == [(sink._hear, True)]
+    assert sink._unshown
+
+
+# -- the thread of a sink ----------------------------------------------------------------------------------------------
+
+
+class DeskSink(ThreadedSink):
+    """A sink whose thread is the test's own; ``fails`` is raised by the step of that name."""
+
+    def __init__(self, step: str = "", fails: Exception | None = None) -> None:
+        super().__init__("desk")
+        self.step, self.fails, self.course = step, fails, list[Any]()
+
+    def _does(self, step: str) -> None:
+        self.course.append(step)
+        if step == self.step and self.fails is not None:
+            raise self.fails
+
+    def _prepare(self, facts: Any, station: Any) -> None:
+        """Nothing is checked."""
+
+    def _begin(self) -> None:
+        self._does("begin")
+
+    def _process_item(self, item: Any) -> None:
+        self._does("item")
+
+    def _finish(self) -> None:
+        self._does("finish")
+
+
+@pytest.mark.parametrize("step", ["begin", "item", "finish"])
+@pytest.mark.parametrize(
+    ("fails", "error", "hint"),
+    [
+        (TedsProvisionError("It broke.", hint="Mend it."), "It broke.", "Mend it."),
+        (OSError(28, "No space"), "desk cannot be written: the disk is full.", "Free some space"),
+        (KeyError("x"), "desk: unexpected KeyError.", "This is a bug: please report it with -vv."),
+    ],
+)
+def test_a_sink_whose_step_fails_is_finished_and_keeps_its_error(
+    step: str, fails: Exception, error: str, hint: str
+) -> None:
+    sink = DeskSink(step, fails)
+    sink.write(block())
+    sink.close()
+    sink.write(block())
+    assert len(sink._items) == 1, "nothing more is taken"
+    sink._work()
+    assert sink.course == {"begin": ["begin", "finish"]}.get(step, ["begin", "item", "finish"])
+    assert (sink.stats.state, sink.stats.error) == ("failed", error)
+    assert sink.stats.hint.startswith(hint)
+
+
+def test_a_sink_that_ends_in_order_has_no_error_and_one_that_does_not_end_is_named() -> None:
+    sink = DeskSink()
+    for _ in range(3):
+        sink.write(block())
+    sink.close()
+    sink._work()
+    assert sink.course == ["begin", "item", "item", "item", "finish"]
+    assert (sink.stats.state, sink.stats.error, sink._owed) == ("ended", "", 0)
+    waited: list[float] = []
+    for alive in (False, True):
+        late: Any = DeskSink()
+        late._thread = SimpleNamespace(join=waited.append, is_alive=lambda alive=alive: alive)
+        late.close()
+        assert late.stats.error == ("desk did not finish within 30 s." if alive else "")
+    assert waited == [30.0, 30.0]
+
+
+def test_if_facts_alone_wait_for_a_live_sink_the_oldest_go_and_no_value_counts_as_dropped() -> None:
+    sink = DeskSink()
+    for number in range(257):
+        sink.report(NodeReport(ARM, "running", samples=number))
+    assert (len(sink._items), sink.stats.dropped) == (256, 0)
+    [(oldest,), (newest,)] = [(sink._items[place][2],) for place in (0, -1)]
+    assert [report.samples for report in (oldest, newest) if isinstance(report, NodeReport)] == [1, 256]
+
+
+def test_a_recorder_takes_up_to_64_items_at_a_time_and_a_live_sink_one() -> None:
+    for recorder, taken in ((True, [64, 36]), (False, [1, 1])):
+        sink = DeskSink()
+        sink.recorder = recorder
+        for number in range(100):
+            sink.report(NodeReport(ARM, "running", samples=number))
+        found = [sink._next() for _ in range(2)]
+        assert [(len(items), done) for items, done in found] == [(count, False) for count in taken]
+        sink.close()
+        while sink._items:
+            sink._next()
+        assert sink._next() == ([], True)
