@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 import struct
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from teds_provision.errors import BadDataError, LinkError, PolicyError
+from teds_provision.errors import BadDataError, LinkError, NotFoundError, PolicyError
 from teds_provision.measure import capture, zero
 from teds_provision.measure.sample_series import SampleSeries, take_samples_of
 from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.measure.zero import ZeroOrder
 from teds_provision.protocol.messages.frames import Command, Function
 from teds_provision.protocol.operation.commands import ChannelState, OperationReply, SampleReply
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.teds.calibration import Calibration, ChannelInterpreter, fit
 from teds_provision.teds.calibration.model import CalibrationInput
 from teds_provision.teds.calibration.samples import SampleForm
@@ -213,3 +216,58 @@ def test_raw_values_that_are_no_numbers_give_neither_point_nor_reading() -> None
     assert series(TEMPERATURE, DEGREES, [4095.0], sample=SampleForm(0, 2, 12)).calibrated().tolist() == pytest.approx(
         [-8.0078125]
     )
+
+
+@pytest.mark.parametrize("does", ["capture", "zero"])
+def test_a_session_that_is_lost_meanwhile_is_reported_by_its_cause_and_nothing_is_written(
+    does: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cause = LinkError("The node does not answer.")
+    held: list[Any] = []
+
+    @contextmanager
+    def own(_station: Any, _links: Any, command: str, *, shared: bool) -> Any:
+        held.append((command, shared))
+        yield "own"
+
+    @contextmanager
+    def at_node(_station: Any, links: Any, uuid: bytes, _reporter: Any, **how: Any) -> Any:
+        held.append((links, uuid, how))
+        yield SimpleNamespace(node="node", station=station)
+
+    def lost(*_words: Any, **_how: Any) -> None:
+        raise SessionLostError(cause)
+
+    required: list[bytes] = []
+    station: Any = SimpleNamespace(
+        nodes=SimpleNamespace(resolve=lambda _name: UUID), policy=SimpleNamespace(require_whitelisted=required.append)
+    )
+    links: Any = SimpleNamespace(after_agreeing=lambda: "links")
+    reporter: Any = SimpleNamespace()
+    module = capture if does == "capture" else zero
+    monkeypatch.setattr(module, "own_source_address", own)
+    monkeypatch.setattr(module, "at_node", at_node)
+    monkeypatch.setattr(capture, "open_trusted", lost)
+    monkeypatch.setattr(zero, "require_session", lost)
+    file = tmp_path / "c.csv"
+    call = {
+        "capture": lambda: capture.capture_at(station, links, "finger", 1, 5.0, file, reporter),
+        "zero": lambda: zero.zero_at(station, links, "finger", ZeroOrder(1), reporter),
+    }[does]
+    with pytest.raises(LinkError) as failed:
+        call()
+    assert failed.value is cause
+    assert held == [
+        (f"calibrate {does} {UUID.hex()}", False),
+        ("own", UUID, {} if does == "capture" else {"unlock": "always", "writes": "calibrate zero"}),
+    ]
+    assert required == ([] if does == "capture" else [UUID])
+    assert list(tmp_path.iterdir()) == []
+    if does == "zero":
+        held.clear()
+        with pytest.raises(LinkError):
+            zero.zero_at(station, links, "finger", ZeroOrder(1), reporter, dry_run=True)
+        assert held[1][2] == {"unlock": "always", "writes": ""}, "a plan asks no other process to let the node go"
+    else:
+        with pytest.raises(NotFoundError, match=r"^There is no folder .*none\.$"):
+            capture.capture_at(station, links, "finger", 1, 5.0, tmp_path / "none" / "c.csv", reporter)
