@@ -8,7 +8,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -126,6 +126,19 @@ def test_without_a_way_to_others_nothing_is_sent(
     assert sent == []
 
 
+def test_a_document_is_sealed_for_a_member_under_its_own_name_for_seven_days(station: Station) -> None:
+    station.unlock()
+    sent, before = list[Parcel](), datetime.now(UTC).replace(microsecond=0)
+    sign_requests.send(station, stub(send=sent.append), station.fingerprint, b"document", "name")
+    [parcel] = sent
+    assert (parcel.id, parcel.to, parcel.sender) == ("name", station.fingerprint, station.fingerprint)
+    assert timedelta(days=7) <= datetime.fromisoformat(parcel.expires) - before < timedelta(days=7, minutes=5)
+    opened = sign_requests.jose.decrypt(
+        parcel.octets, station.credentials().key, cty=sign_requests.CONTENT_TYPE, max_octets=9999
+    )
+    assert opened == b"document"
+
+
 def test_an_inbox_gives_each_document_once_until_it_is_dropped(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,7 +215,7 @@ def test_what_an_inbox_cannot_open_is_for_nobody(station: Station, monkeypatch: 
     header = {"typ": SIGN_REQUEST.typ}
     monkeypatch.setattr(sign_requests.jose, "decrypt", lambda *_, **__: b"head.rest.sign")
     monkeypatch.setattr(sign_requests, "decode_base64url", lambda text, _: text)
-    monkeypatch.setattr(sign_requests, "load_object", lambda _octets, _what: header)
+    monkeypatch.setattr(sign_requests, "load_object", lambda octets, _what: header if octets == b"head" else {})
     assert inbox._opened(b"{sealed") == b"head.rest.sign"
     assert inbox._opened(b"sealed") is None
     header["typ"] = "JOSE"
@@ -380,7 +393,8 @@ def test_a_folder_gets_each_page_once_and_a_registry_its_own_alone(
                 )
     monkeypatch.setattr(sync, "octets_of", lambda row: row.hash.encode())
     monkeypatch.setattr(sync, "hash_of", lambda octets: octets.decode())
-    monkeypatch.setattr(sync, "counted_places", lambda *_: {(1, h(f"{me[:4]}1")), (3, h(f"{me[:4]}3"))})
+    counted = {(1, h(f"{me[:4]}1")), (3, h(f"{me[:4]}3")), (1, h("eeee1"))}
+    monkeypatch.setattr(sync, "counted_places", lambda *_: counted)
 
     def pushed(*, folder: bool, there: dict[str, list[str]], heads: dict[str, int]) -> tuple[list[str], int]:
         sent = list[str]()
@@ -389,7 +403,10 @@ def test_a_folder_gets_each_page_once_and_a_registry_its_own_alone(
             assert (previous, octets) == (h(f"{of[:4]}{n - 1}"), hash.encode())
             sent.append(hash)
 
-        pages = lambda of, after: [CarriedPage(of, 1, hash.encode()) for hash in there.get(of, ())]  # noqa: E731
+        def pages(of: str, after: int) -> list[CarriedPage]:
+            assert (folder, after) == (True, 0), "of a registry the heads are enough; another history may be lower"
+            return [CarriedPage(of, 1, hash.encode()) for hash in there.get(of, ())]
+
         done = stub(pushed=0)
         transport = stub(carries_all=folder, heads=lambda: heads, pages=pages, append=append)
         sync._push(station, transport, cast("Any", None), cast("Any", done), connected=False)
@@ -402,6 +419,38 @@ def test_a_folder_gets_each_page_once_and_a_registry_its_own_alone(
     assert pushed(folder=False, there={}, heads={}) == ([mine[0], mine[2]], 2), "a page that was given up stays here"
     assert pushed(folder=False, there={}, heads={me: 1}) == ([mine[2]], 1)
     assert pushed(folder=False, there={me: []}, heads={me: 3}) == ([], 0)
+
+
+@pytest.mark.parametrize(
+    ("connected", "folder", "url", "before", "after"),
+    [
+        (True, False, "postgresql://office/plant", 1, 3),
+        (True, True, None, 1, 3),
+        (True, False, "postgresql://office/plant", 5, 3),  # the database was rolled back and is filled again
+        (False, True, "file:/media/one", 1, 3),  # a disk has another path on each machine
+        (False, True, "postgresql://office/plant", 1, 1),
+        (False, True, None, 1, 1),
+        (False, False, "file:/media/one", 1, 1),
+        (True, False, None, 3, 3),
+    ],
+)
+def test_what_the_joined_registry_has_is_acknowledged(
+    station: Station, monkeypatch: pytest.MonkeyPatch, connected: bool, folder: bool, url: str | None, before: int,
+    after: int,
+) -> None:  # fmt: skip
+    kept = list[int]()
+    put = station.plant.put_record
+    with station.transaction():
+        put(PlantRecord(REGISTRY, url=url, acknowledged=before))
+        chain = station.plant.pages.chain(station.fingerprint)
+        station.plant.pages.put_chain(replace(chain, counted=(3, h("3"))))
+    monkeypatch.setattr(sync, "counted_places", lambda *_: set())
+    monkeypatch.setattr(station.plant, "put_record", lambda record: kept.append(record.acknowledged) or put(record))
+    transport = stub(carries_all=folder, heads=dict, pages=lambda *_: [])
+    sync._push(station, transport, cast("Any", None), cast("Any", stub(pushed=0)), connected=connected)
+    record = station.plant.joined
+    assert record is not None
+    assert (record.acknowledged, record.url, kept) == (after, url, [after] if after != before else [])
 
 
 def test_events_of_pages_that_were_given_up_are_stated_again(station: Station) -> None:
