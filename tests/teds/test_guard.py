@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit, read_calibrations
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
-from teds_provision.teds.curve import Curve, channel_of
+from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.guard import GuardFinding, check_calibration
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
@@ -413,6 +413,25 @@ def test_an_overdue_calibration_is_reported_if_the_time_is_given(tactile: Profil
     assert check_calibration(blocks, None, tactile) == []
     found = check_calibration(blocks, None, tactile, now=datetime(2026, 1, 1, tzinfo=UTC))
     assert codes(found, "warning") == {"overdue"}
+
+
+@pytest.mark.parametrize(("boundaries", "apart"), [(8, 8000), (4000, 15)])
+def test_of_several_inputs_the_samples_stay_as_few_as_their_grid_allows(boundaries: int, apart: int) -> None:
+    """Both sides of each boundary are looked at, or of an even share of them: a grid grows with their product."""
+    edges = tuple(float(apart * number) for number in range(boundaries))
+    segments = boundaries - 1
+    parts = (CalibrationInput(1, 0, edges, edges[:-1]), CalibrationInput(2, 0, (0.0, 65535.0), (0.0,)))
+    grid = Calibration(1, "steps", parts, tuple(float(number) for number in range(segments)), unit=parse_unit("N"))
+    channels = {
+        number: CurveChannel(number, grid.unit.units, 0.0, 1e9, 0.1, (0.0, 65535.0), False, True) for number in (1, 2)
+    }
+    curve = curve_of(grid, channels[1], channels)
+    own = curve.axes[0]
+    assert own[0] == 0.0
+    assert own[-1] == 65535.0
+    assert len(own) <= 500 + 2 * min(boundaries, 500)
+    steps = {float(edge) for edge in edges} & set(own.tolist())
+    assert len(steps) >= (boundaries if boundaries == 8 else 300)
 
 
 @pytest.mark.parametrize("kept", ["CalInput", "Coefs", None], ids=str)

@@ -109,6 +109,15 @@ def test_show_says_that_the_node_is_wrapped() -> None:
     assert dict(shown.summary)["wrapped"].startswith("CAN message Torque (dbc): the node's proof ends at the wrapper")
 
 
+def test_show_says_of_other_lines_that_they_are_none_of_the_profile() -> None:
+    """Whoever reads them is not told that the node is wrapped, nor that it is not."""
+    stranger = frame(bytes.fromhex("030400820101") + raw_tuple(4, b"kind=usb\nname=bmp280\n"))
+    with pytest.raises(BadDataError) as why:
+        read_origin(stranger)
+    summary = dict(describe(TedsBlock(*ORIGIN, stranger)).summary)
+    assert summary == {"form": f"not the Origin TEDS of the profile: {why.value.message}"}
+
+
 def test_the_other_edition_has_the_same_form() -> None:
     octets, findings = teds.convert(teds.decode(TORQUE.encode()), 2024)
     assert octets == TORQUE.encode()
