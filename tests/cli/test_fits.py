@@ -64,6 +64,17 @@ def test_one_node_is_judged_alone_and_people_see_a_table(known: Path) -> None:
     assert COARSE.hex() not in done.out
 
 
+def test_the_table_names_node_channel_result_and_why(known: Path) -> None:
+    rows = [line.split(None, 1) for line in call(known, "nodes", "--fits", TASK).out.splitlines()]
+    assert rows[0] == ["UUID", "channel  result   why"]
+    found = {uuid: " ".join(rest.split()) for uuid, rest in rows[1:]}
+    entries = call(known, "--json", "nodes", "--fits", TASK).json["fits"]
+    assert len(entries) == len(found)
+    for entry in entries:
+        channel = "" if entry["channel"] is None else f"{entry['channel']} {entry['name']} "
+        assert found[entry["uuid"]] == " ".join(f"{channel}{entry['result']} {entry['why']}".split())
+
+
 def test_an_expression_that_means_nothing_is_a_usage_error(known: Path) -> None:
     done = call(known, "nodes", "--fits", "angel >= 3 deg")
     assert done.code == 2

@@ -242,6 +242,12 @@ def test_what_is_measured_and_why_others_are_not(home: Path, running: Running, m
     assert call(home, "ncap", "measure", "all").out.splitlines()[1:] == ["1 node matches now, 0 present: n1."]
     survey = MatchSurvey((), {})
     assert call(home, "ncap", "measure", "all").out.splitlines()[1:] == ["0 nodes match now."]
+    survey = MatchSurvey(tuple(uuids[1:6]), {uuid: f"reason {number}" for number, uuid in enumerate(uuids[6:11])})
+    five = call(home, "ncap", "measure", "all").out.splitlines()[1:]
+    assert five == [
+        "5 nodes match now, 1 present: n1, n2, n3, n4, n5.",
+        *(f"Not n{number + 6}: reason {number}." for number in range(5)),
+    ], "five are named without a remainder"
 
 
 def test_detection_address_and_tokens(home: Path, running: Running) -> None:

@@ -423,6 +423,26 @@ def test_a_node_without_channels_needs_no_source(
         assert board.battery is not None
 
 
+def test_each_wrapped_node_has_its_own_reader_and_its_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[dict[str, Any]] = []
+    monkeypatch.setattr(virtual_nodes.node_room, "Board", lambda _sheet, **facts: made.append(facts))
+    app: Any = SimpleNamespace(warn=lambda _text: None)
+    lines: Any = SimpleNamespace(observer_of=lambda uuid: uuid)
+    wrapped: Any = SimpleNamespace(source=lambda number: f"reader {number}")
+    files = [FlashFile.create(tmp_path / name, uuid=bytes.fromhex(UUID)) for name in "ab"]
+    make = virtual_nodes._boards(app, lines, "noise", 50.0, wrapped)
+    for file in files:
+        make(file)
+    virtual_nodes._boards(app, lines, "noise", 50.0, None)(files[0])
+    lag = virtual_nodes.node_room.wrapped.wrapped_source.LAG
+    assert lag > 0
+    assert [(facts["source"], facts["lag"], facts["shown"]) for facts in made] == [
+        ("reader 0", lag, UUID),
+        ("reader 1", lag, UUID),
+        ("noise", 0, UUID),
+    ]
+
+
 def test_signals_reach_every_node_that_runs() -> None:
     course: list[str] = []
 
