@@ -48,7 +48,14 @@ from teds_provision.plant import (
 from teds_provision.plant.connecting import NotMemberError
 from teds_provision.plant.fetching import take_carried
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.plant.sign_requests import FileOffice, Inbox, JoinedOffice, OfficeOrder, RemoteOffice
+from teds_provision.plant.sign_requests import (
+    FileOffice,
+    Inbox,
+    JoinedOffice,
+    OfficeOrder,
+    OfficeSilentError,
+    RemoteOffice,
+)
 from teds_provision.plant.sync import ForkError
 from teds_provision.plant.transport import CarriedPage, Parcel
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
@@ -297,6 +304,34 @@ def test_a_draft_is_signed_over_a_file_or_a_transport_and_kept(
     assert closed == ["node", "node", "transport"]
 
 
+def test_what_a_node_has_is_not_asked_for_and_an_office_may_be_silent(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station.unlock()
+    same, asked = [True], list[str]()
+    wanted: Any = stub(
+        sequence=9, office=station.fingerprint, job="job", profile=None, image=Image(NODE, {(0, 1): b"x"})
+    )
+    keys: Any = stub(uuid=NODE)
+    office: Any = stub(request_signature=lambda request: asked.append(request.octets))
+    monkeypatch.setattr(sign_requests, "_says_the_same", lambda *args: same[0] and args[4] == b"on the node")
+    monkeypatch.setattr(sign_requests.security, "decode", lambda _: stub(sequence=8))
+    monkeypatch.setattr(sign_requests, "_earlier", lambda *_: None)
+    monkeypatch.setattr(sign_requests, "_new_request", lambda *_: stub(octets="new", hash="h"))
+    done = sign_requests.by_office(station, office, cast("Any", None), keys, wanted, b"on the node")
+    assert (done.sequence, done.reused, asked) == (8, True, [])
+    assert done.image.security == b"on the node"
+    for on_node, says in ((b"on the node", False), (None, True)):
+        same[0] = says
+        with pytest.raises(OfficeSilentError) as error:
+            sign_requests.by_office(station, office, cast("Any", None), keys, wanted, on_node)
+        assert (error.value.message, error.value.hint) == (
+            "The office owner has not answered yet.",
+            "The request is kept. Run the same command again once the office has signed.",
+        )
+    assert asked == ["new", "new"]
+
+
 def test_a_board_that_signs_with_another_key_gets_no_request(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
     station.unlock()
     wanted = stub(image=Image(NODE, {(0, 1): b"meta"}), epoch=1, sequence=2, office=station.fingerprint, job="job")
@@ -541,6 +576,8 @@ def test_an_earlier_request_is_repeated_and_its_answer_used_if_it_is_newer(
     assert (done.image, done.sequence) == (f"image of {asked or 'kept'}", 12 if asked else answered)
     assert len(stored) == (3 if asked else 0), "a new signature is durable with its draft and its sequence"
     assert not stored or stored[2] == (NODE, 12)
+    signed = [entry for entry in station.audit_log.entries() if (entry.act, entry.outcome) == ("sign", "by office")]
+    assert [entry.detail for entry in signed] == ([{"sequence": 12, "office": "office"}] if asked else [])
 
 
 def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:

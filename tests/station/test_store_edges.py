@@ -17,6 +17,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import BadDataError, NodeBusyError, StoreError, StoreLockedError
+from teds_provision.station.station import Station
 from teds_provision.station.store import connection, database, dump, lock, row_sample
 from teds_provision.station.store.audit import _linked
 from teds_provision.station.store.database import Database, open_copy
@@ -338,6 +339,31 @@ def test_who_holds_the_store_is_named_if_it_lives(place: Path, holder: object, n
     finally:
         os.close(descriptor)
     assert lock.holder_of(place) is None, "what the last holder left names no holder"
+
+
+def test_a_station_holds_the_store_for_a_command_and_for_what_is_nested_in_it(station: Station) -> None:
+    def holder() -> str:
+        return (lock.holder_of(station.home) or "(nobody)").partition("(")[2].partition(")")[0]
+
+    for _ in range(2):  # the second time as the first
+        assert holder() == "nobody"
+        with station.lock("agree"):
+            assert holder() == "agree"
+            with station.lock("rotate"), station.durable("sign"):
+                assert holder() == "agree"
+            assert holder() == "agree", "what was nested let go of nothing"
+        with pytest.raises(ValueError, match="cut"), station.lock("agree"):
+            raise ValueError("cut")
+        assert holder() == "nobody"
+        with station.durable("sign"):
+            assert holder() == "sign"
+
+
+def test_a_store_of_the_present_schema_is_opened_while_another_process_writes(store: Store) -> None:
+    with closing(sqlite3.connect(store.path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with Store.open(store.home) as again:
+            assert again.id == store.id
 
 
 @pytest.mark.parametrize("told", [True, False])
