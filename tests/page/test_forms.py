@@ -373,6 +373,44 @@ def test_without_an_image_a_board_or_a_right_there_is_no_plan(firmware: Stage) -
     assert text(firmware, ".plan") == "", "that was about another image"
 
 
+def test_an_image_may_be_dropped_and_marks_the_place_while_it_is_above_it(firmware: Stage) -> None:
+    firmware.run(
+        """
+        const files = new DataTransfer();
+        files.items.add(new File(["z"], "dropped.bin"));
+        const place = document.querySelector(".drop");
+        const drag = (name) => place.dispatchEvent(new DragEvent(name, { dataTransfer: files, cancelable: true }));
+        const names = ["dragover", "dragleave", "dragenter", "drop"];
+        window.over = names.map((name) => [drag(name), place.classList.contains("over")]);
+        """
+    )
+    firmware.page.get_by_text("dropped.bin, 1 KiB").wait_for()
+    assert firmware.run("return window.over") == [[False, True], [False, False], [False, True], [False, False]]
+    change(firmware, connection="lost")
+    assert firmware.page.locator(".drop.off").count() == 1
+    firmware.run("window.panel.take(new File(['z'], 'late.bin'))")
+    assert text(firmware, ".drop strong") == "dropped.bin, 1 KiB", "nothing is taken while it is disabled"
+
+
+@pytest.mark.parametrize(
+    ("made", "accepted"),
+    [
+        ("new update.UpdatePanel(main, () => [], () => 0)", ".bin,application/octet-stream"),
+        ("new write.WritePanel(words[0], () => 0)", ".xml,.json,application/xml,application/json"),
+        ("new provision.ProvisionTab(main, words[0])", ".csv,.toml,.json,.txt,.xml"),
+        ("virtual.virtualView(main)", ".xml,.json,application/xml,application/json"),
+    ],
+)
+def test_the_choice_of_a_file_offers_what_is_read(stage: Stage, made: str, accepted: str) -> None:
+    nodes(stage, gripper())
+    script = f"""
+      const main = document.getElementById("main"), made = show({made});
+      const file = main.querySelector("input[type=file]") ?? made.file;
+      return file.accept;
+    """
+    assert stage.run(script, ARM) == accepted
+
+
 def test_how_an_update_goes_is_told_board_by_board(firmware: Stage) -> None:
     error = {"message": "It is silent.", "hint": "Switch it off."}
     boards: list[dict[str, Any]] = [

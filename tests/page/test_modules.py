@@ -279,6 +279,13 @@ def test_a_node_is_what_the_station_read_of_it(stage: Stage) -> None:
     )  # fmt: skip
 
 
+def test_what_a_node_does_in_a_measurement_is_a_word(stage: Stage) -> None:
+    states = {"running": "measuring", "refused": "refused, not measured", "lost": "lost, not measured",
+              "ended": "not measured", "waiting": "waiting to be measured"}  # fmt: skip
+    wires = [({"measurement": "m", "measuring": {"state": state}}, words) for state, words in states.items()]
+    stage.table("shapes.node(one).mode", [*wires, ({"measurement": "m"}, "waiting to be measured"), ({}, NONE)])
+
+
 def test_the_points_that_are_kept_are_the_newest_in_their_order(stage: Stage) -> None:
     held = """
       const { Ring } = window.page.ring;

@@ -65,6 +65,7 @@ def test_a_group_is_created_from_its_name_and_selected_nodes(measuring: Stage) -
     assert sent(measuring)[1:] == [{"method": "POST", "path": "groups", "body": {"name": "arm", "uuids": [HAND]}}]
     assert measuring.said == "Group arm created. Press Start to measure it."
     assert measuring.page.locator(".new input:checked").count() == 0
+    assert texts(measuring, ".new .trouble") == [], "that was another try"
 
 
 def test_a_group_starts_with_what_its_card_says(measuring: Stage) -> None:
