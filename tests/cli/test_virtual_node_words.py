@@ -16,6 +16,7 @@ from teds_provision.cli.node.virtual_nodes import ActuatorLines
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import ActuatorReading
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.teds.profile import load_profile
 from tests.e2e.desk import ROOT
 
 from .shell import call
@@ -342,6 +343,7 @@ def test_a_reset_by_hand_and_its_plan(home: Path, tmp_path: Path) -> None:
         assert "--dry-run" not in words or (folder / "flash.json").read_bytes() == before
 
 
+@pytest.mark.parametrize("charged", [False, True])
 @pytest.mark.parametrize(
     ("given", "kinds"),
     [
@@ -352,7 +354,7 @@ def test_a_reset_by_hand_and_its_plan(home: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_node_is_served_on_each_link_that_is_named(
-    monkeypatch: pytest.MonkeyPatch, given: dict[str, str], kinds: list[str]
+    monkeypatch: pytest.MonkeyPatch, given: dict[str, str], kinds: list[str], charged: bool
 ) -> None:
     made: list[Any] = []
     tapped: list[Any] = []
@@ -360,26 +362,33 @@ def test_a_node_is_served_on_each_link_that_is_named(
     class Server:
         def __init__(self, kind: str, *_: Any, **how: Any) -> None:
             self.kind, self.how, self.added = kind, how, list[Any]()
-            self.restarted, self.announce_press = (lambda *_: None), (lambda *_: None)
+            self.restarted = lambda *of: course.append((kind, "restarted", *of))
+            self.announce_press = lambda *of: course.append((kind, "pressed", *of))
             self.address = SimpleNamespace(octets=bytes(6))
             made.append(self)
 
         def tapped(self) -> None:
             tapped.append(self.kind)
 
-        def send_data(self, *_: Any, **__: Any) -> None: ...
+        def send_data(self, *of: Any, **_: Any) -> None:
+            course.append((self.kind, "sent", *of))
 
         def add(self, node: Any, *, counts_as_tapped: Any, measuring_handler: Any) -> None:
             self.added.append((node, counts_as_tapped(), measuring_handler is node))
 
+    course, restarted, pressed, streams = list[Any](), list[Any](), list[Any](), list[Any]()
+    battery = SimpleNamespace(field=lambda *, present: course.append(("field", present)), power=lambda: "power")
     node: Any = SimpleNamespace(
         in_factory_state=lambda: True,
-        board=None,
+        board=SimpleNamespace(battery=battery) if charged else None,
         flash_file=SimpleNamespace(path=Path("/x/flash.json")),
-        when_restarted=lambda _call: None,
-        announces_presses_over=lambda _call: None,
-        streams_over=lambda *_: None,
+        when_restarted=restarted.append,
+        announces_presses_over=pressed.append,
+        streams_over=lambda *of: streams.append(of),
     )
+    charging = virtual_nodes.node_room.tnep
+    monkeypatch.setattr(charging, "charge_records", lambda power: (f"charge of {power}",))
+    monkeypatch.setattr(charging, "out_of_band_record", lambda octets, *, random: (octets, random))
     room = virtual_nodes.node_room
     for name, kind in (("NfcServer", "nfc"), ("CanServer", "can"), ("BleServer", "ble")):
         monkeypatch.setattr(room, name, lambda *given, kind=kind, **how: Server(kind, *given, **how))
@@ -396,7 +405,20 @@ def test_a_node_is_served_on_each_link_that_is_named(
         assert (how["wt_int"], how["pace"]) == (20, True), "in steps of four"
         how["extras"].field(present=True)
         assert tapped == (["ble"] if "ble" in by_kind else [])
-        assert len(how["extras"].after()) == ("ble" in by_kind)
+        assert how["extras"].after() == (((bytes(6), True),) if "ble" in by_kind else ())
+        assert how["extras"].before() == (("charge of power",) if charged else ())
+        assert course == ([("field", True)] if charged else [])
+    course.clear()
+    for call_it in (*restarted, *pressed):
+        call_it()
+    frame = SimpleNamespace(identifier=5, data=b"x", fd=True)
+    for send, *_ in streams:
+        send(frame)
+    of_bus = [("can", "restarted", node), ("can", "pressed", node), ("can", "sent", node, 5, b"x")]
+    of_air = [("ble", "restarted"), ("ble", "sent", frame)]
+    of_reader = [("nfc", "restarted")]
+    wanted = {"can": of_bus, "ble": of_air, "nfc": of_reader}
+    assert sorted(course, key=str) == sorted((one for kind in kinds for one in wanted[kind]), key=str)
 
 
 @pytest.mark.parametrize(
@@ -457,3 +479,34 @@ def test_signals_reach_every_node_that_runs() -> None:
     virtual_nodes._reset_all([node("a"), node("b")], lines)
     virtual_nodes._press_all([node("a"), node("b")])
     assert course == ["reset a", "line a", "reset b", "line b", "press a", "press b"]
+
+
+@pytest.mark.parametrize(("percent", "wrapped"), [(None, False), (50.0, False), (None, True)])
+def test_nodes_with_channels_have_their_source_and_a_battery_if_one_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, percent: float | None, wrapped: bool
+) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(virtual_nodes.node_room, "Board", lambda sheet, **how: made.append((sheet, how)))
+    monkeypatch.setattr(virtual_nodes.node_room, "Battery", lambda percent: f"{percent} %")
+    warnings: list[str] = []
+    app: Any = SimpleNamespace(warn=warnings.append)
+    lines: Any = SimpleNamespace(observer_of=lambda uuid: f"lines of {uuid}")
+    sources: Any = SimpleNamespace(source=lambda number: f"sensor {number}") if wrapped else None
+    make = virtual_nodes._boards(app, lines, "sine:2", percent, sources)
+    uuids = [bytes([number]) * 10 for number in (1, 2)]
+    for uuid in uuids:
+        hardware = load_profile("gripper").build(uuid).blocks
+        make(cast(Any, SimpleNamespace(load=lambda uuid=uuid: SimpleNamespace(uuid=uuid), hardware=hardware)))
+    lag = virtual_nodes.node_room.wrapped.wrapped_source.LAG if wrapped else 0
+    assert lag or not wrapped
+    assert [how for _, how in made] == [
+        {
+            "source": f"sensor {number}" if wrapped else "sine:2",
+            "lag": lag,
+            "battery": None if percent is None else "50.0 %",
+            "shown": f"lines of {uuid.hex()}",
+            "notify": app.warn,
+        }
+        for number, uuid in enumerate(uuids)
+    ]
+    assert ([len(sheet.channels) for sheet, _ in made], warnings) == ([3, 3], [])

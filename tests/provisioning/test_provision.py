@@ -30,7 +30,7 @@ from teds_provision.provisioning.build import BuildOrder, PreparedOrder
 from teds_provision.provisioning.calibration_guard import merged
 from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.identify import IdentifiedNode
-from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.progress import SilentReporter, StepResult
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
@@ -481,7 +481,8 @@ def test_what_is_looked_at_before_a_board_is_keyed_and_what_a_run_returns(
     begins: list[str],
 ) -> None:
     course: list[Any] = []
-    prepared = PreparedOrder(BuildOrder(), load_profile("gripper") if typed else None)
+    fitted: Any = {"fitted": None}
+    prepared = PreparedOrder(BuildOrder(), load_profile("gripper") if typed else None, fitted)
     of_unit = replace(prepared, warnings=("of the unit",))
     unit: Any = SimpleNamespace(prepared=of_unit)
     line = SimpleNamespace(allot_unit=lambda *_: (course.append("unit"), unit)[1]) if with_line else None
@@ -494,7 +495,7 @@ def test_what_is_looked_at_before_a_board_is_keyed_and_what_a_run_returns(
     readings = iter(["plain", "sealed"] if demanded else ["sealed"])
     demand: Any = "demand" if demanded else None
     monkeypatch.setattr(module, "shown_by", lambda _node, numbers: sorted(numbers))
-    monkeypatch.setattr(module, "differences", lambda shown, *_: tuple(map(str, shown)))
+    monkeypatch.setattr(module, "differences", lambda shown, _type, calibrated: (*map(str, shown), *calibrated))
     monkeypatch.setattr(module, "read_firmware", lambda _node: next(readings))
     monkeypatch.setattr(
         module, "require_firmware", lambda _uuid, wanted, found: course.append(f"firmware {found}" if wanted else "any")
@@ -504,7 +505,9 @@ def test_what_is_looked_at_before_a_board_is_keyed_and_what_a_run_returns(
     monkeypatch.setattr(module, "certificate_brought", lambda calibrations: f"of {calibrations}")
     run._prepared = lambda _who: prepared
     run._firmware_demand = lambda *_: demand
-    run._require_its_board = lambda _who, _prepared, changes: course.append("its board") if changes else None
+    run._require_its_board = lambda _who, _prepared, changes: (
+        course.append("its board") if changes == ("1", "2", "3", "fitted") else course.append(changes)
+    )
     run._whitelist = lambda _who: (course.append("whitelist"), "entry")[1]
     run._agree = lambda _who, entry: course.append(f"agree {entry}")
     run._build = lambda _who, order, _present: (course.append(("build", order.warnings)), proposal)[1]
@@ -642,3 +645,115 @@ def test_a_failure_is_in_the_log_with_its_step_unless_the_disk_is_full(
     if not full:
         [entry] = [entry for entry in station.audit_log.entries() if entry.act == "provision"]
         assert (entry.outcome, entry.detail) == ("refused", {"step": "sign", "why": "It may not."})
+
+
+@pytest.mark.parametrize("with_line", [False, True])
+def test_a_line_hears_of_a_board_what_it_sent_now_and_who_it_is(
+    station: Station, monkeypatch: pytest.MonkeyPatch, with_line: bool
+) -> None:
+    who: Any = SimpleNamespace(uuid=bytes(10), fingerprint="ab" * 32)
+    asked: list[Any] = []
+    monkeypatch.setattr(
+        provision_module,
+        "identify",
+        lambda _station, _node, *, expect, recall: (asked.append((expect, recall)), who)[1],
+    )
+    run = a_run(station, line=SimpleNamespace() if with_line else None)
+    assert run._identify() is who
+    assert asked == [(run._choose, not with_line)], "the evidence of a line recalls nothing"
+    [step] = run.steps.done
+    assert (step.name, step.result, step.detail) == ("identify", "done", f"{bytes(10).hex()}, key abababababababab")
+
+
+CELL = PreparedOrder(BuildOrder(), load_profile("gripper"))
+
+
+@pytest.mark.parametrize(
+    ("order", "state", "known", "prepared_for", "found"),
+    [
+        (BuildOrder(profile="gripper"), NodeState.FACTORY, None, ["gripper"], CELL),
+        (CELL, NodeState.FACTORY, None, [], CELL),
+        (PreparedOrder(BuildOrder(calibration=Path("a.csv"))), NodeState.PROVISIONED, None, [None], CELL),
+        (PreparedOrder(BuildOrder()), NodeState.PROVISIONED, None, [], PreparedOrder(BuildOrder())),
+        (PreparedOrder(BuildOrder()), NodeState.FACTORY, "gripper", [], PreparedOrder(BuildOrder())),
+        (PreparedOrder(BuildOrder(adopt=True)), NodeState.FACTORY, None, [], PreparedOrder(BuildOrder(adopt=True))),
+        (PreparedOrder(BuildOrder()), NodeState.FACTORY, None, [], None),
+        (PreparedOrder(BuildOrder()), NodeState.KEYED, "", [], None),
+    ],
+)
+def test_an_order_is_prepared_for_its_very_board_once_and_a_new_board_needs_a_type(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    order: Any,
+    state: NodeState,
+    known: str | None,
+    prepared_for: list[str | None],
+    found: PreparedOrder | None,
+) -> None:
+    asked, named = list[Any](), list[Any]()
+
+    def prepare(_station: Station, one: BuildOrder, uuid: bytes) -> PreparedOrder:
+        asked.append(one.profile)
+        return CELL
+
+    def named_for(_station: Station, uuid: bytes, one: PreparedOrder, *, keep: bool) -> PreparedOrder:
+        named.append((uuid, keep))
+        return one
+
+    monkeypatch.setattr(provision_module, "prepare", prepare)
+    monkeypatch.setattr(provision_module, "named_for", named_for)
+    if known is not None:
+        with station.transaction():
+            station.nodes.put(NodeRecord(bytes(10), profile=known or None))
+    run = a_run(station)
+    run.order = order
+    who: Any = SimpleNamespace(uuid=bytes(10), state=state)
+    if found is None:
+        with pytest.raises(TedsProvisionError, match=bytes(10).hex()):
+            run._prepared(who)
+        return
+    assert run._prepared(who) == found
+    assert (asked, named) == (prepared_for, [(bytes(10), True)])
+
+
+@pytest.mark.parametrize(
+    ("listed", "named", "course"),
+    [(True, False, []), (False, False, ["own CA", "entry", "accept"]), (False, True, ["own CA", "entry"])],
+)
+def test_a_stranger_is_accepted_by_a_person_or_by_its_sheet_if_it_has_no_other_owner(
+    station: Station, monkeypatch: pytest.MonkeyPatch, listed: bool, named: bool, course: list[str]
+) -> None:
+    did: list[str] = []
+    who: Any = SimpleNamespace(
+        uuid=bytes(10), whitelisted="entry" if listed else None, state=NodeState.KEYED, security_teds=b"shown"
+    )
+    given: list[Any] = []
+    monkeypatch.setattr(provision_module, "require_own_ca", lambda *words: (did.append("own CA"), given.append(words)))
+    monkeypatch.setattr(provision_module, "new_whitelist_entry", lambda *_: (did.append("entry"), "new entry")[1])
+    run = a_run(station, operator=SimpleNamespace(accept=lambda _who: did.append("accept")))
+    run.named = lambda _who: named
+    assert run._whitelist(who) == (None if listed else "new entry")
+    assert did == course
+    assert given == ([] if listed else [(station, bytes(10), NodeState.KEYED, b"shown")])
+    done = [(step.name, step.result) for step in run.steps.done]
+    assert done == ([("whitelist", "nothing to do")] if listed else []), "it is done once the entry is kept"
+
+
+@pytest.mark.parametrize(("fresh", "listed", "pinned", "whole"), [(True, True, False, True), (False, False, True, True),
+                                                                  (True, False, False, False)])  # fmt: skip
+def test_a_newcomer_is_reported_as_whitelisted_once_its_entry_is_kept(
+    station: Station, monkeypatch: pytest.MonkeyPatch, fresh: bool, listed: bool, pinned: bool, whole: bool
+) -> None:
+    who: Any = SimpleNamespace(uuid=bytes(10))
+    agreed = SimpleNamespace(epoch=3, key_id="0123", fresh=fresh, listed=listed)
+    given: list[Any] = []
+    monkeypatch.setattr(provision_module, "agree", lambda *words, **how: (given.append(how), agreed)[1])
+    monkeypatch.setattr(type(station.pins), "entry", lambda *_: object() if pinned else None)
+    run = a_run(station)
+    run._enlisting = StepResult("whitelist")
+    assert run._agree(who, "entry") is agreed
+    assert given == [{"newcomer": "entry", "take_over": run.operator.take_over}]
+    *before, step = run.steps.done
+    assert [one.name for one in before] == (["whitelist"] if whole else [])
+    assert (step.name, step.result) == ("agree", "done" if fresh else "nothing to do")
+    assert step.detail == "key epoch 3, key 0123"
