@@ -662,3 +662,67 @@ def test_the_plan_of_an_import_names_what_it_does_with_each_node_and_ban(
         *([] if known else [f"The CA {'c' * 32} will be trusted for these nodes only."]),
         means[mode],
     ]
+
+
+@pytest.mark.parametrize(
+    ("fresh", "mode", "again", "step"),
+    [
+        ((True, False), "move", "",
+         "\nTo complete the move with its receipt: teds-provision handover receipt FILE.receipt"),
+        ((False, False), "copy", " (nothing to do: it already exists)", ""),
+        ((False, True), "copy", "", ""),
+    ],
+)  # fmt: skip
+def test_an_export_in_several_files_is_new_if_one_of_them_is(
+    fresh: tuple[bool, bool], mode: str, again: str, step: str
+) -> None:
+    said: list[tuple[dict[str, Any], str]] = []
+    app: Any = SimpleNamespace(emit=lambda result, text: said.append((result, text)))
+    plans: list[Any] = [SimpleNamespace(mode=mode, id=f"id{number}", nodes=[1] * number) for number in (1, 2)]
+    done: list[Any] = [
+        SimpleNamespace(sha256=f"sha{number}", octets=100 * number, fresh=new)
+        for number, new in zip((1, 2), fresh, strict=True)
+    ]
+    result: dict[str, Any] = {"bundles": [{"bundle": "k"}, {"bundle": "k.2"}]}
+    handover._print_export(app, plans, [Path("k"), Path("k.2")], result, done)
+    assert said == [(result, f"3 nodes in k, k.2, handover id1{again}.{step}")]
+    assert (result["sha256"], result["octets"], result["fresh"]) == ("sha1", 300, any(fresh))
+    assert result["bundles"] == [
+        {"bundle": "k", "sha256": "sha1", "octets": 100, "fresh": fresh[0]},
+        {"bundle": "k.2", "sha256": "sha2", "octets": 200, "fresh": fresh[1]},
+    ]
+
+
+@pytest.mark.parametrize("proven", [(), (0,), (0, 1)])
+def test_nodes_that_are_proven_already_are_not_waited_for(
+    proven: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uuids = [bytes.fromhex(uuid) for uuid in UUIDS[:2]]
+    met: list[Any] = []
+    known = {uuids[number] for number in proven}
+
+    def prove(_station: Any, links: Any, waiting: list[bytes], _reporter: Any, *, hold: Any) -> list[Any]:
+        met.append((links, list(waiting), hold()))
+        return [NodeProof(waiting[0], 4, True), *(NodeProofFailure(uuid, "it is silent") for uuid in waiting[1:])]
+
+    monkeypatch.setattr(handover, "proven_of", lambda _station, some: {uuid for uuid in some if uuid in known})
+    monkeypatch.setattr(handover, "prove_nodes", prove)
+    monkeypatch.setattr(handover, "reporter_for", lambda _app: None)
+    said: list[tuple[dict[str, Any], str]] = []
+    app: Any = SimpleNamespace(note="note", emit=lambda result, text: said.append((result, text)))
+    station: Any = SimpleNamespace(lock=lambda command, note: (command, note))
+    notes = SimpleNamespace(uuids=[uuid.hex() for uuid in uuids], refused=[])
+    done: Any = SimpleNamespace(uuids=uuids, notes=notes, fresh=True)
+    outcomes = handover._prove(app, station, done, cast(Any, "links"))
+    waiting = [uuid for uuid in uuids if uuid not in known]
+    assert met == ([("links", waiting, ("import-keys", "note"))] if waiting else [])
+    wanted = [(True, ""), (False, "it is silent")][: len(waiting)]
+    assert [(outcome["rotated"], outcome["why"]) for outcome in outcomes] == wanted
+    assert [outcome["uuid"] for outcome in outcomes] == [uuid.hex() for uuid in waiting]
+    result: dict[str, Any] = {"imported": [uuid.hex() for uuid in uuids]}
+    handover._print_import(app, station, done, Path("r"), result, outcomes)
+    shown = said[0][0]
+    assert shown["proven"] == [uuid.hex() for uuid in uuids if uuid in known]
+    assert shown["pending"] == [uuid.hex() for uuid in waiting]
+    assert shown["not_proven"] == ({UUIDS[1]: "it is silent"} if len(waiting) == 2 else {})
+    assert (shown["receipt"], shown["fresh"]) == ("r", True)
