@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, StoreLockedError
 from teds_provision.measure.sinks.mcap import recover as recovery
@@ -91,6 +91,7 @@ def test_a_record_that_is_damaged_goes_with_all_up_to_the_next_chunk(tmp_path: P
     )  # fmt: skip
     assert path.read_bytes() == octets
     assert messages_in(tmp_path / "run.mcap.recovered") == [("/x1", 7)]
+    assert b"/recovered/" not in done.output.read_bytes(), "a topic outside of chunks was described a second time"
 
 
 @pytest.mark.parametrize(
@@ -286,3 +287,75 @@ def test_a_file_that_was_replaced_meanwhile_is_left_alone(tmp_path: Path, monkey
     assert refused.value.message == f"{path} was replaced in the meantime."
     assert refused.value.hint == "Run the same command again."
     assert path.read_bytes() == b"another file"
+
+
+WHOLE = KIND + channel() + b"".join(GOOD)
+RUBBISH = b"\xff" * 5000
+
+
+def test_a_file_that_is_whole_gives_no_other_file_even_if_one_was_asked_for(tmp_path: Path) -> None:
+    path = finished(tmp_path / "run.mcap", WHOLE)
+    done = recover(path, tmp_path / "other.mcap")
+    assert (done.was_whole, done.output, done.cut, done.messages) == (True, None, 0, 1)
+    assert [found.name for found in tmp_path.iterdir()] == ["run.mcap"]
+    bare = finished(tmp_path / "bare.mcap", KIND)
+    assert (recover(bare).messages, recover(bare).until) == (0, None)
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_torn_end_is_cut_off_in_place_or_left_out_of_the_file_that_was_asked_for(tmp_path: Path, named: bool) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(BEGIN + WHOLE + RUBBISH)
+    done = recover(path, tmp_path / "other.mcap" if named else None)
+    assert (done.cut, done.damaged, done.was_whole, done.messages) == (5000, (), False, 1)
+    assert done.output == (tmp_path / "other.mcap" if named else None)
+    made = done.output or path
+    octets = made.read_bytes()
+    assert octets.startswith(BEGIN + WHOLE)
+    assert octets.endswith(MAGIC)
+    assert RUBBISH[:64] not in octets
+    assert recover(made).was_whole
+    if named:
+        assert path.read_bytes() == BEGIN + WHOLE + RUBBISH
+
+
+def test_a_damaged_file_goes_where_it_was_asked_to(tmp_path: Path) -> None:
+    path = finished(tmp_path / "run.mcap", KIND, channel(), chunk(message(), crc=1), *GOOD)
+    assert recover(path, tmp_path / "other.mcap").output == tmp_path / "other.mcap"
+    assert sorted(found.name for found in tmp_path.iterdir()) == ["other.mcap", "run.mcap"]
+    assert (tmp_path / "other.mcap").stat().st_mode & 0o777 == path.stat().st_mode & 0o777 & 0o644
+
+
+@pytest.mark.parametrize("place", [-20, -40])
+def test_a_damaged_summary_is_made_anew_in_another_file(tmp_path: Path, place: int) -> None:
+    path = finished(tmp_path / "run.mcap", WHOLE)
+    octets = bytearray(path.read_bytes())
+    octets[place] ^= 1
+    path.write_bytes(octets)
+    begin = len(BEGIN + WHOLE)
+    done = recover(path)
+    assert done.damaged == (Damage("summary", begin, len(octets) - begin),)
+    assert path.read_bytes() == octets
+    assert messages_in(tmp_path / "run.mcap.recovered") == [("/x1", 7)]
+
+
+def test_a_file_that_was_cut_behind_its_first_octets_is_one_without_anything(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(MAGIC)
+    done = recover(path)
+    assert (done.messages, done.until, done.was_whole, done.cut) == (0, None, False, 0)
+    assert recover(path).was_whole
+
+
+def test_a_message_outside_of_chunks_has_a_topic_too(tmp_path: Path) -> None:
+    path = finished(tmp_path / "run.mcap", chunk(KIND + channel(), crc=1), message(3, 4))
+    done = recover(path)
+    assert done.output is not None
+    assert messages_of_stream(done.output) == [("/recovered/channel_4", 3)]
+
+
+def messages_of_stream(path: Path) -> list[tuple[str, int]]:
+    """Topic and log time of each message, as a reader of another program finds them from the first octet on."""
+    with path.open("rb") as file:
+        reader = NonSeekingReader(file, validate_crcs=True)
+        return [(topic.topic, one.log_time) for _, topic, one in reader.iter_messages(log_time_order=False)]

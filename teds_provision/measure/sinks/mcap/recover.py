@@ -442,6 +442,11 @@ class _Scan:
                 used |= kept.counts.keys()
                 for code, content in kept.described:
                     _describe(known, code, content)
+            elif (code := self.octets[kept[0]]) in (SCHEMA, CHANNEL, MESSAGE):  # of another program: outside of chunks
+                content = self.octets[kept[0] + HEAD.size : kept[1]]
+                _describe(known, code, content)
+                if code == MESSAGE:
+                    used.add(int.from_bytes(content[:2], "little"))
         elsewhere = McapSummary()
         for body in (*self._spoiled, self._summary):  # the summary has a good checksum, so it takes precedence
             for _, code, content in _inside(body):
