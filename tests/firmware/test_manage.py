@@ -544,6 +544,19 @@ def test_a_restart_comes_also_if_its_reply_is_never_taken() -> None:
     assert desk.firmware.restarts == 1
 
 
+@pytest.mark.parametrize(("link", "at_once"), [("can:f1", True), ("can:f7", True), ("nfc", False), ("ble:2", False)])
+def test_a_bus_off_restarts_a_node_whose_reply_was_on_that_bus_and_no_other(link: str, at_once: bool) -> None:
+    desk = Board.make()
+    desk.agree().open(link=link)
+    assert desk.session is not None
+    frame = desk.session.seal(Command(0, 128, MANAGE, packet(smp.RESTART))).encode()
+    desk.node.handle(frame, link=link, tapped=link == "nfc")
+    desk.node.bus_off()
+    assert desk.firmware.restarts == at_once
+    desk.node.reply_sent(link)
+    assert desk.firmware.restarts == 1
+
+
 # -- when: claims, staging, uploads ------------------------------------------------------------------------------------
 
 

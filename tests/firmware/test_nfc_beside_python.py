@@ -247,6 +247,20 @@ def reader_frame(dice: random.Random, number: int, length: int) -> bytes:
     return dice.choice((b"\xc2", b"\xf2\x01", bytes((dice.choice((0x00, 0x40, 0xD0, 0xFF)),)) + dice.randbytes(2)))
 
 
+def test_the_initial_message_is_there_from_the_start() -> None:
+    """Before any field: a chip may show it to a reader by itself."""
+    node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
+    node.has_nfc(max_ndef=499)
+    assert node.start() == 0
+    service, identity = message.decode(node.nfc_message())
+    assert service.is_well_known(b"Tp")
+    uri = b"urn:nfc:xsn:teds-provision:tim"
+    assert service.payload == b"\x10" + bytes((len(uri),)) + uri + b"\0\x04\x0f\x01\xf3"
+    assert identity.type == b"teds-provision:id"
+    assert identity.payload[:12] == b"\1" + UUID + b"\0"
+    node.close()
+
+
 def test_what_a_deselected_tag_and_one_that_was_asked_nothing_reply() -> None:
     node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
     node.has_nfc()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.links.can.isotp import physical_id, single
-from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.protocol.messages.frames import IDENTIFY, Function, security_command
 from tests.firmware.desk import CDesk
 from tests.firmware.memory_node import MemoryNode
 from tests.firmware.test_manage import Firmware
@@ -125,8 +125,43 @@ def test_the_oldest_reply_gives_way(stations: Stations) -> None:
         stations.locate(0xF1 + number)
     assert len(stations.firmware.blinks) == PLACES + 1
     for number in range(1, PLACES + 1):
+        stations.now += 1
         stations.locate(0xF1 + number)
     assert len(stations.firmware.blinks) == PLACES + 1, "those that came later are there"
+    stations.now += 1
     stations.locate(0xF1)
     assert len(stations.firmware.blinks) == PLACES + 2
+    for number in (0xF3, 0xF4):
+        stations.locate(number)
+    assert len(stations.firmware.blinks) == PLACES + 2, "it took the place of the oldest once more"
+    stations.locate(0xF2)
+    assert len(stations.firmware.blinks) == PLACES + 3
     stations.node.close()
+
+
+@pytest.mark.parametrize("number", [0xF1, 0xF2, 0xF7])
+def test_strangers_take_no_place_of_a_reply_in_a_session(number: int) -> None:
+    """Whichever place it has: strangers have asked before it, or not."""
+    desk = CDesk()
+    desk.agree().open(link=f"can:{number:02x}")
+    assert desk.session is not None
+
+    def ask(station: int, body: bytes) -> bytes:
+        desk.now += 0.1
+        desk.node.take_frame(physical_id(desk.node.can_address, station), single(body, fd=True), fd=True)
+        desk.node.poll()
+        sent = desk.node.next_frame()
+        assert sent is not None
+        return sent[1]
+
+    sealed = b"\x07" + desk.session.seal(IDENTIFY).encode()
+    for station in range(0xF1, number):
+        ask(station, b"\x05" + IDENTIFY.encode())
+    reply = ask(number, sealed)
+    assert reply[:2] == b"\x00\x38", "56 octets in one frame"
+    for _ in range(2):
+        for station in range(0xF1, 0xF8):
+            if station != number:
+                assert b"\x05\x01" in ask(station, b"\x05" + IDENTIFY.encode())
+        assert ask(number, sealed) == reply, "a repetition gets the stored reply, and no refusal 13"
+    CDesk.close_all()

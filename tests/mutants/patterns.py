@@ -5196,6 +5196,27 @@ C_PATTERNS = (
         "",
         _C_TESTS,
     ),
+    CPattern(
+        "what strangers ask takes no place of a session's reply",
+        "replies.c",
+        "if (each->used && teds_session_on(node, each->link) != NULL) {",
+        "if (0) {",
+        "tests/firmware/test_replies.py",
+    ),
+    CPattern(
+        "the tag shows its initial message from the start",
+        "tnep.c",
+        "    if (node->config->nfc.present) {\n        show_initial(node);\n    }\n",
+        "",
+        "tests/firmware/test_nfc_beside_python.py",
+    ),
+    CPattern(
+        "Set CAN address leaves no copy of the link key on the stack",
+        "commands.c",
+        "        teds_wipe(&state, sizeof state);\n",
+        "",
+        "tests/firmware/test_wiping.py",
+    ),
 )
 
 SCRIPT_PATTERNS = (
