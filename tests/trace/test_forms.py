@@ -516,3 +516,35 @@ def test_a_block_of_an_impossible_length_is_named_with_its_place(length: int) ->
     with pytest.raises(BadDataError) as refused:
         list(pcapng.read_pcapng(head + le(6, length) + bytes(60)))
     assert refused.value.message == f"The pcapng block at octet {len(head)} says it has {length} octets."
+
+
+def test_what_follows_the_end_of_the_options_is_none() -> None:
+    data = b"\x98\xda\x21\xf1\1\0\0\0\1"
+    for options, direction in ((OUT + END + IN, "out"), (END + OUT, "in"), (OUT, "out")):
+        (record,) = pcapng.read_pcapng(pcapng.head() + packet(0, 0, data, options))
+        assert record.direction == direction
+
+
+@pytest.mark.parametrize(
+    "options", [b"", option(2, b"can"), option(9, b"\6") + option(2, b"can"), option(12, b"Linux")]
+)
+def test_times_are_in_microseconds_unless_an_interface_says_otherwise(options: bytes) -> None:
+    own = le_block(1, struct.pack("<HHI", 264, 0, 0) + options + END)
+    (record,) = pcapng.read_pcapng(pcapng.head() + own + packet(3, 1_500_000, b"\0\xfe\0\1\x0a", b""))
+    assert record.time == 1.5
+
+
+def test_the_words_of_a_message_are_in_a_comment_alone() -> None:
+    (record,) = pcapng.read_pcapng(pcapng.head() + packet(2, 0, b"\1", option(4, b"abcd") + OUT + END))
+    assert record.command == ""
+    (record,) = pcapng.read_pcapng(pcapng.head() + packet(2, 0, b"\1", option(4, b"abcd") + option(1, b"List") + END))
+    assert record.command == "List"
+
+
+def test_octets_that_a_packet_says_and_lacks_are_named() -> None:
+    head, body = pcapng.head(), le(0, 0, 0, 9, 9) + bytes(8)
+    with pytest.raises(BadDataError) as refused:
+        list(pcapng.read_pcapng(head + le_block(6, body)))
+    assert refused.value.message == (
+        f"The pcapng block at octet {len(head)} does not parse: 9 octets are said to be captured, 8 are there."
+    )
