@@ -277,20 +277,23 @@ def test_a_draft_is_signed_over_a_file_or_a_transport_and_kept(
         ways.append(way)
         assert (node, keys.uuid, keys.key, on_node) == ("node", NODE, b"point", None)
         assert (wanted.job, wanted.office, wanted.image, wanted.name) == ("job", station.fingerprint, image, "cell 1")
-        assert (wanted.calibration, wanted.epoch, wanted.sequence, wanted.profile) == (b"raw", 3, 9, "load-cell")
+        assert (wanted.calibration, wanted.epoch, wanted.sequence, wanted.profile) == (calibration, 3, 9, "load-cell")
         return stub(image=signed)
 
     monkeypatch.setattr(sign_requests, "find_job", lambda *_: job)
     monkeypatch.setattr(sign_requests, "at_node", lambda *_, **__: Visit())
-    monkeypatch.setattr(sign_requests, "require_session", lambda *_: None)
+    monkeypatch.setattr(sign_requests, "require_session", lambda _station, node: closed.append(f"session of {node}"))
     monkeypatch.setattr(sign_requests, "read_identity", lambda _: stub(epoch=3, sequence=9))
     monkeypatch.setattr(sign_requests, "own_name", lambda *_: "cell 1")
     monkeypatch.setattr(sign_requests, "by_office", by_office)
-    (tmp_path / "cal.csv").write_bytes(b"raw")
+    (tmp_path / "cal.csv").write_bytes(bytes(1 << 20))
+    (tmp_path / "large.csv").write_bytes(bytes((1 << 20) + 1))
+    calibration: bytes | None = bytes(1 << 20)
     (tmp_path / "stick").mkdir()
     monkeypatch.setattr(FolderTransport, "close", lambda _: closed.append("transport"))
-    for output in (tmp_path / "request.jws", None):
-        order = OfficeOrder(NODE.hex(), "owner", "0b5f", tmp_path / "cal.csv", tmp_path / "stick", output)
+    for output, file in ((tmp_path / "request.jws", tmp_path / "cal.csv"), (None, None)):
+        calibration = bytes(1 << 20) if file is not None else None
+        order = OfficeOrder(NODE.hex(), "owner", "0b5f", file, tmp_path / "stick", output)
         done = sign_requests.sign_by_office(station, cast("Any", stub(timeout=2.5)), order, cast("Any", None))
         assert done.image is signed
         draft = station.datasheets.draft(NODE)
@@ -301,7 +304,10 @@ def test_a_draft_is_signed_over_a_file_or_a_transport_and_kept(
     assert ways[0] == FileOffice(tmp_path / "request.jws")
     assert isinstance(ways[1], RemoteOffice)
     assert ways[1].timeout == 2.5
-    assert closed == ["node", "node", "transport"]
+    assert closed == ["session of node", "node", "session of node", "node", "transport"]
+    order = OfficeOrder(NODE.hex(), "owner", "0b5f", tmp_path / "large.csv", tmp_path / "stick", None)
+    with pytest.raises(BadDataError):
+        sign_requests.sign_by_office(station, cast("Any", stub(timeout=2.5)), order, cast("Any", None))
 
 
 def test_what_a_node_has_is_not_asked_for_and_an_office_may_be_silent(
@@ -345,6 +351,108 @@ def test_a_board_that_signs_with_another_key_gets_no_request(station: Station, m
     with pytest.raises(NotAuthenticError) as error:
         evidence.prove_claim(node, claim, bytes(16))
     assert error.value.message == "The node's signature of the evidence does not match the key it presented."
+
+
+SIGNER, BOARD = SoftwareKey(41), SoftwareKey(42)
+OF_SIGNER = fingerprint(SIGNER.point)
+
+
+@pytest.mark.parametrize(
+    ("changes", "by", "same"),
+    [
+        ({}, None, True),
+        ({}, OF_SIGNER, True),
+        ({}, WEST, False),  # another member with sign than the one that was asked
+        ({"signed": False}, None, False),
+        ({"node_key": SIGNER.point}, None, False),
+        ({"node_key_signature": b"of another UUID"}, None, False),
+        ({"station_key": None}, None, False),
+        ({"station_key": BOARD.point}, None, False),  # no member with sign
+        ({"key_epoch": 2}, None, False),
+        ({"signed_blocks": "of another image"}, None, False),
+        ({"station_key_signature": b"of another CA"}, None, False),
+        ({"good": False}, None, False),
+        ({"damaged": True}, None, False),
+    ],
+)
+def test_a_security_teds_says_the_same_if_each_part_of_it_does(
+    station: Station, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], by: str | None, same: bool
+) -> None:
+    shown = stub(**{
+        "signed": True, "node_key": BOARD.point, "node_key_signature": b"102", "station_key": SIGNER.point,
+        "key_epoch": 3, "signed_blocks": ("digests of", "blocks"), "station_key_signature": b"104", "good": True,
+        "damaged": False, **changes,
+    })  # fmt: skip
+
+    def decode(octets: bytes) -> Any:
+        assert octets == b"teds"
+        if shown.damaged:
+            raise BadDataError("damaged")
+        return shown
+
+    known = (station.ca, shown.station_key, b"104")
+    monkeypatch.setattr(sign_requests.security, "decode", decode)
+    monkeypatch.setattr(sign_requests, "datasheet", stub(
+        digests=lambda blocks: ("digests of", blocks), is_certified=lambda *given: given == known,
+        signature_good=lambda given, octets, uuid: given.good and (octets, uuid) == (b"teds", NODE),
+    ))  # fmt: skip
+    roster: Any = stub(has=lambda digits, role: (digits, role) == (OF_SIGNER, "sign"))
+    keys: Any = stub(uuid=NODE, key=BOARD.point, signature=b"102")
+    wanted: Any = stub(epoch=3, image=stub(blocks="blocks"))
+    assert sign_requests._says_the_same(station, roster, keys, wanted, b"teds", by=by) is same
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [
+        ("job", "Ask the operator of the office: signer run --job ID."),
+        ("full", "Set the board aside, or ask the keeper for another job."),
+        ("differs", "Station and office need the same profile and version of the program."),
+        ("sequence", "Someone at the office must confirm it: signer once FILE --jump"),
+        ("revoked", ""),
+    ],
+)
+def test_an_answer_is_the_offices_to_this_request_or_a_refusal_with_its_cure(
+    station: Station, monkeypatch: pytest.MonkeyPatch, word: str, hint: str
+) -> None:
+    answer = stub(of="H of request", refused="", why="", security=b"security", sequence=7)
+
+    def open_answer(octets: bytes, find: Callable[[str], bytes | None]) -> Any:
+        assert (octets, find("office"), find("another")) == (b"answer", b"point", None)
+        return answer
+
+    same = [True]
+    monkeypatch.setattr(sign_requests, "open_answer", open_answer)
+    monkeypatch.setattr(sign_requests, "hash_of", lambda octets: f"H of {octets.decode()}")
+    monkeypatch.setattr(sign_requests, "_says_the_same", lambda *args, by: same[0] and (args[4], by) == (
+        b"security", "office"))  # fmt: skip
+    roster: Any = stub(point_of=lambda digits: b"point", name_of=lambda digits: f"the {digits}")
+    wanted: Any = stub(office="office", image=Image(NODE, {(0, 1): b"meta"}))
+
+    def taken(request: bytes = b"request") -> Any:
+        return sign_requests._taken(station, roster, cast("Any", None), wanted, request, b"answer")
+
+    done = taken()
+    assert (done.image.security, done.image.blocks[0, 1], done.sequence, done.reused) == (
+        b"security",
+        b"meta",
+        7,
+        False,
+    )
+    with pytest.raises(NotAuthenticError, match="The office's answer belongs to another request"):
+        taken(b"another")
+    same[0] = False
+    with pytest.raises(NotAuthenticError) as error:
+        taken()
+    assert (error.value.message, error.value.hint) == (
+        "The office signed something other than what was requested.", "Ask the owner to check this office."
+    )  # fmt: skip
+    answer.refused, answer.why = word, "as it is."
+    with pytest.raises(sign_requests.OfficeRefusedError) as refused:
+        taken()
+    assert (refused.value.message, refused.value.hint) == (
+        f"The office the office does not sign ({word}): as it is.", hint
+    )  # fmt: skip
 
 
 def test_a_request_goes_to_the_place_that_is_joined_now(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
