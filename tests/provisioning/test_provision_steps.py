@@ -1,0 +1,222 @@
+"""The steps of ``provision`` from the datasheet on, each by its clauses, without a board."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning import provision as module
+from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
+from teds_provision.provisioning.board_type import HardwareCheck
+from teds_provision.provisioning.build import BuildOrder, PreparedOrder
+from teds_provision.provisioning.progress import StepResult
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import Draft
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile import load_profile
+
+from .test_provision import a_run
+
+UUID = bytes(10)
+WHO: Any = SimpleNamespace(uuid=UUID, point=b"point", key_signature=b"signature")
+IMAGE = Image(UUID, {(0, 12): b"name", (0, 1): b"meta"})
+
+
+def last(run: Any) -> tuple[str, str, str]:
+    step: StepResult = run.steps.done[-1]
+    return step.name, step.result, step.detail
+
+
+@pytest.mark.parametrize(
+    ("typed", "adopt", "state", "changes", "profile", "result", "detail", "course"),
+    [
+        (True, False, NodeState.KEYED, True, "gripper", "done", "gripper, 2 TEDS; fits", ["type", "propose", "image"]),
+        (False, False, NodeState.KEYED, True, None, "done", "2 TEDS; fits", ["propose", "image"]),
+        (False, False, NodeState.PROVISIONED, False, None, "nothing to do", "2 TEDS; fits", ["propose", "image"]),
+        (False, True, NodeState.KEYED, True, None, "done", "2 TEDS; fits", ["adopt", "image"]),
+        (False, True, NodeState.PROVISIONED, True, None, "done", "2 TEDS; fits", ["propose", "image"]),
+    ],
+)
+def test_a_datasheet_is_proposed_or_adopted_and_held_against_the_board(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: bool,
+    adopt: bool,
+    state: NodeState,
+    changes: bool,
+    profile: str | None,
+    result: str,
+    detail: str,
+    course: list[str],
+) -> None:
+    did: list[Any] = []
+    confirm = object()
+    run = a_run(station, operator=SimpleNamespace(confirm=confirm))
+    prepared = PreparedOrder(BuildOrder(adopt=adopt), load_profile("gripper") if typed else None)
+    present: Any = SimpleNamespace(image=SimpleNamespace(blocks={}), identity=SimpleNamespace(state=state))
+    proposal: Any = SimpleNamespace(
+        image=IMAGE, changes=("one",) if changes else (), calibrations={1: "c"}, profile=profile,
+        require_a_yes=lambda ask: did.append(ask is confirm),
+    )  # fmt: skip
+    monkeypatch.setattr(module, "differences", lambda _has, wanted, *_: ("image",) if wanted is IMAGE else ("type",))
+    monkeypatch.setattr(module, "propose", lambda *_: (did.append("propose"), proposal)[1])
+    monkeypatch.setattr(module, "sentence", lambda _calibration: "fits")
+    run._adopted = lambda *_: (did.append("adopt"), proposal)[1]
+    run._require_its_board = lambda _who, _prepared, found: did.append(found[0])
+    assert run._build(WHO, prepared, present) is proposal
+    assert did == [*course, True]
+    assert last(run) == ("build", result, detail)
+
+
+@pytest.mark.parametrize(("errors", "reason", "course"), [((), None, ["adopt"]), (("overdue",), "known", ["adopt"]),
+                                                           (("overdue",), None, None)])  # fmt: skip
+def test_what_a_board_brought_is_adopted_after_the_question_and_with_errors_for_a_reason(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    errors: tuple[str, ...],
+    reason: str | None,
+    course: list[str] | None,
+) -> None:
+    did: list[str] = []
+    brought = FactoryDatasheet(IMAGE, "finger", (), errors, ("old",))
+    monkeypatch.setattr(
+        module, "read_factory_datasheet", lambda _station, _image, *, name: (did.append(name), brought)[1]
+    )
+    run = a_run(station, operator=SimpleNamespace(adopt=lambda _brought: did.append("adopt")))
+    prepared = PreparedOrder(BuildOrder(name="mine", accept_calibration=reason))
+    present: Any = SimpleNamespace(image=IMAGE)
+    if course is None:
+        with pytest.raises(NotAdoptedError, match="is refused: overdue"):
+            run._adopted(prepared, present)
+        assert did == ["mine"], "nobody is asked about what is refused"
+        return
+    proposal = run._adopted(prepared, present)
+    assert did == ["mine", *course]
+    assert (proposal.image, proposal.changes, proposal.named, proposal.warnings, proposal.name) == (
+        IMAGE, (), True, ("old",), "finger",
+    )  # fmt: skip
+    entries = {entry.act: entry for entry in station.audit_log.entries()}
+    assert (entries["adopt"].outcome, entries["adopt"].detail) == (
+        "accepted", {"teds": IMAGE.digest(), "name": "finger"},
+    )  # fmt: skip
+    accepted = {"why": "known", "findings": ["overdue"]} if errors else None
+    assert (entries["accept-datasheet"].detail if "accept-datasheet" in entries else None) == accepted
+
+
+@pytest.mark.parametrize("reused", [False, True])
+@pytest.mark.parametrize(
+    ("office", "stage", "intact", "state", "on_node", "earlier"),
+    [
+        (True, None, True, NodeState.KEYED, None, ()),
+        (False, "signed", True, NodeState.PROVISIONED, b"on node", (b"drafted",)),
+        (False, "built", True, NodeState.PROVISIONED, b"on node", ()),
+        (False, None, True, NodeState.PROVISIONED, b"on node", ()),
+        (False, None, False, NodeState.PROVISIONED, None, ()),
+        (False, None, True, NodeState.KEYED, None, ()),
+    ],
+)
+def test_a_datasheet_is_signed_by_the_office_or_here_unless_a_signature_still_holds(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    office: bool,
+    stage: Any,
+    intact: bool,
+    state: NodeState,
+    on_node: bytes | None,
+    earlier: tuple[bytes, ...],
+    reused: bool,
+) -> None:
+    given: dict[str, Any] = {}
+    signed = SimpleNamespace(sequence=7, reused=reused)
+    run = a_run(station)
+    run.unit = SimpleNamespace(sign=lambda *_: signed if office else None)
+    run.released = True
+    if stage is not None:
+        station.datasheets.keep_draft(Draft(UUID, Image(UUID, {SECURITY: b"drafted"}), stage, None))
+    proposal: Any = SimpleNamespace(image=IMAGE, profile="gripper")
+    has = Image(UUID, {**(IMAGE.blocks if intact else {}), SECURITY: b"on node"})
+    present: Any = SimpleNamespace(image=has, identity=SimpleNamespace(state=state, epoch=3, sequence=6))
+    measured: list[Any] = []
+
+    def sign(_station: Station, keys: Any, image: Image, **how: Any) -> Any:
+        assert (keys.uuid, keys.key, keys.signature, image) == (UUID, b"point", b"signature", IMAGE)
+        how.pop("before")()
+        given.update(how)
+        return signed
+
+    monkeypatch.setattr(module, "sign", sign)
+    monkeypatch.setattr(module, "require_not_measured", lambda *_, released: measured.append(released))
+    assert run._sign(WHO, proposal, present) is signed
+    result = "nothing to do" if reused else "done"
+    assert last(run) == ("sign", result, "sequence 7, by the office" if office else "sequence 7")
+    assert measured == ([] if office else [True])
+    assert given == ({} if office else {
+        "epoch": 3, "node_sequence": 6, "on_node": on_node, "earlier": earlier, "keep_draft": True,
+        "profile": "gripper", "write_follows": True,
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize(("octets", "result", "detail"), [(70, "done", "70 octets"), (0, "nothing to do", "")])
+def test_what_is_written_goes_with_its_facts_and_its_progress(
+    station: Station, monkeypatch: pytest.MonkeyPatch, octets: int, result: str, detail: str
+) -> None:
+    low = object()
+    run = a_run(station, operator=SimpleNamespace(low_battery=low))
+    given: list[Any] = []
+    written = SimpleNamespace(octets=octets)
+    monkeypatch.setattr(module, "write", lambda *words, **how: (given.append((words[2:], how)), written)[1])
+    proposal: Any = SimpleNamespace(profile="gripper", name=None, profile_digest="ab")
+    assert run._write(SimpleNamespace(image=IMAGE), proposal, "present") is written
+    facts = {"profile": "gripper", "profile_digest": "ab"}
+    how = {"present": "present", "progress": run.reporter.written, "facts": facts, "low": low}
+    assert given == [((IMAGE,), how)]
+    assert last(run) == ("write", result, detail)
+
+
+@pytest.mark.parametrize("of_line", [False, True])
+@pytest.mark.parametrize(("verdict", "result"), [("authentic", "done"), ("not authentic", "failed")])
+def test_a_verdict_is_that_of_what_is_on_the_node(
+    station: Station, monkeypatch: pytest.MonkeyPatch, verdict: str, result: str, of_line: bool
+) -> None:
+    run = a_run(station)
+    run.unit = object() if of_line else None
+    given: list[Any] = []
+    judged = SimpleNamespace(verified=SimpleNamespace(verdict=verdict))
+    monkeypatch.setattr(module, "judge_and_keep", lambda *words, **how: (given.append((words[2:], how)), judged)[1])
+    assert run._verify(WHO, SimpleNamespace(on_node="on node")) is judged.verified
+    assert given == [(("on node", b"point"), {"by": "provision", "more_follows": of_line})]
+    assert last(run) == ("verify", result, verdict)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "typed", "channels", "result", "detail"),
+    [
+        ("authentic", True, {1: True, 2: False, 3: None}, "done", "1 of 3 channels match the hardware"),
+        ("authentic", False, {1: True}, "done", "1 of 1 channels match the hardware"),
+        ("authentic", True, {1: None}, "skipped", "it does not measure"),
+        ("not authentic", True, {1: True}, "skipped", ""),
+    ],
+)
+def test_hardware_is_asked_about_an_authentic_datasheet_in_the_units_of_its_type(
+    station: Station,
+    monkeypatch: pytest.MonkeyPatch,
+    verdict: str,
+    typed: bool,
+    channels: dict[int, bool | None],
+    result: str,
+    detail: str,
+) -> None:
+    run, asked = a_run(station), list[Any]()
+    borne = HardwareCheck(channels)
+    monkeypatch.setattr(module, "check_hardware", lambda _node, image, units: (asked.append((image, units)), borne)[1])
+    monkeypatch.setattr(module, "shown_units", lambda *_: "units of the store")
+    monkeypatch.setattr(module, "units_of", lambda _channels: "units of the type")
+    prepared = PreparedOrder(BuildOrder(), load_profile("gripper") if typed else None)
+    verified: Any = SimpleNamespace(verdict=verdict)
+    found = run._check(prepared, cast(Any, SimpleNamespace(on_node="on node")), verified)
+    units = "units of the type" if typed else "units of the store"
+    assert (found, asked) == ((borne, [("on node", units)]) if verdict == "authentic" else (HardwareCheck({}), []))
+    assert last(run) == ("check", result, detail)
