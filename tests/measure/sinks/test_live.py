@@ -477,6 +477,18 @@ def test_sensors_alone_are_no_joint_and_their_owner_is_not_guessed() -> None:
     assert [dict(joint.state) for joint in joints_of(twice, topics)] == [{"effort": 3}], "which of them is not known"
 
 
+def test_sensors_belong_to_actuators_in_the_order_of_their_numbers_however_they_came() -> None:
+    actuator, position, force = gripper()
+    second = [
+        replace(facts, number=facts.number + 3, name=f"thumb {facts.name}") for facts in (actuator, position, force)
+    ]
+    first = [actuator, position, force]
+    wanted = [(1, {"position": 2, "effort": 3}), (4, {"position": 5, "effort": 6})]
+    for facts in ([*first, *second], [*second, *first], [*reversed(second), *reversed(first)]):
+        joints = joints_of(facts, Topics(STATION))
+        assert sorted((joint.actuator, dict(joint.state)) for joint in joints) == wanted
+
+
 def test_the_datasheet_is_on_a_topic_whole() -> None:
     curve = Calibration(
         1, "linear", (CalibrationInput(1, 1, (0.0, 65535.0), (0.0,)),), (0.5, 0.25), parse_unit("degree")
