@@ -484,7 +484,8 @@ def test_sensors_belong_to_actuators_in_the_order_of_their_numbers_however_they_
     ]
     first = [actuator, position, force]
     wanted = [(1, {"position": 2, "effort": 3}), (4, {"position": 5, "effort": 6})]
-    for facts in ([*first, *second], [*second, *first], [*reversed(second), *reversed(first)]):
+    crossed = [first[0], second[0], second[1], first[1], first[2], second[2]]
+    for facts in ([*first, *second], [*second, *first], crossed, crossed[::-1]):
         joints = joints_of(facts, Topics(STATION))
         assert sorted((joint.actuator, dict(joint.state)) for joint in joints) == wanted
 
