@@ -17,6 +17,7 @@ from teds_provision import measure as measure_room
 from teds_provision.cli.rendering import local_time
 from teds_provision.cli.service import ncap as commands
 from teds_provision.cli.service.ncap import DaemonLog
+from teds_provision.errors import LinkError
 from teds_provision.measure.matching import MatchSurvey
 from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
@@ -410,3 +411,37 @@ def test_a_writer_that_hangs_at_the_end_delays_the_exit_of_no_service_that_ended
         monkeypatch.setattr(DaemonLog, "end", lambda _log, written=written: written)
         assert call(home, "ncap", "run").code == 0
         assert ended == ([] if written else [0])
+
+
+def test_a_service_that_fails_has_printed_its_events_before_its_error(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course: list[str] = []
+
+    def run(*_: Any) -> None:
+        course.append("run")
+        raise LinkError("The address is taken.")
+
+    monkeypatch.setattr(commands.service_run, "run", run)
+    monkeypatch.setattr(DaemonLog, "end", lambda _log: course.append("end"))
+    monkeypatch.setattr(Station, "unlock", lambda _station: course.append("unlock"))
+    done = call(home, "--json", "ncap", "run")
+    assert (done.code, done.json["error"]["message"]) == (5, "The address is taken.")
+    assert course == ["unlock", "run", "end"], "no passphrase is asked for later"
+
+
+def test_a_group_that_does_not_exist_is_refused_before_the_service_begins(home: Path, ran: list[Any]) -> None:
+    done = call(home, "--json", "ncap", "run", "--measure", "group:nobody")
+    assert (done.code, "nobody" in done.json["error"]["message"], ran) == (3, True, [])
+
+
+def test_a_part_of_an_optional_room_may_refuse_a_station(
+    home: Path, ran: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    kinds = [SimpleNamespace(name=name, require=lambda _station, name=name: asked.append(name)) for name in ("a", "b")]
+    monkeypatch.setattr(commands.service_part, "KINDS", SimpleNamespace(parts=lambda: kinds))
+    settings_of = commands.settings.Settings
+    monkeypatch.setattr(commands.settings, "Settings", lambda **how: settings_of(**how | {"parts": ("b",)}))
+    assert call(home, "ncap", "run").code == 0
+    assert (asked, ran[0].parts) == (["b"], ("b",))

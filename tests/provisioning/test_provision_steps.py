@@ -34,6 +34,7 @@ def last(run: Any) -> tuple[str, str, str]:
     ("typed", "adopt", "state", "changes", "profile", "result", "detail", "course"),
     [
         (True, False, NodeState.KEYED, True, "gripper", "done", "gripper, 2 TEDS; fits", ["type", "propose", "image"]),
+        (True, False, NodeState.FACTORY, True, None, "done", "2 TEDS; fits", ["type", "propose", "image"]),
         (False, False, NodeState.KEYED, True, None, "done", "2 TEDS; fits", ["propose", "image"]),
         (False, False, NodeState.PROVISIONED, False, None, "nothing to do", "2 TEDS; fits", ["propose", "image"]),
         (False, True, NodeState.KEYED, True, None, "done", "2 TEDS; fits", ["adopt", "image"]),
@@ -55,13 +56,19 @@ def test_a_datasheet_is_proposed_or_adopted_and_held_against_the_board(
     did: list[Any] = []
     confirm = object()
     run = a_run(station, operator=SimpleNamespace(confirm=confirm))
-    prepared = PreparedOrder(BuildOrder(adopt=adopt), load_profile("gripper") if typed else None)
+    fitted: Any = {1: "fitted"} if state is NodeState.KEYED else None
+    prepared = PreparedOrder(BuildOrder(adopt=adopt), load_profile("gripper") if typed else None, fitted)
     present: Any = SimpleNamespace(image=SimpleNamespace(blocks={}), identity=SimpleNamespace(state=state))
     proposal: Any = SimpleNamespace(
         image=IMAGE, changes=("one",) if changes else (), calibrations={1: "c"}, profile=profile,
         require_a_yes=lambda ask: did.append(ask is confirm),
     )  # fmt: skip
-    monkeypatch.setattr(module, "differences", lambda _has, wanted, *_: ("image",) if wanted is IMAGE else ("type",))
+
+    def differences(_has: object, wanted: object, *calibrated: object) -> tuple[str, ...]:
+        assert calibrated == (() if wanted is IMAGE else (fitted or (),))
+        return ("image",) if wanted is IMAGE else ("type",)
+
+    monkeypatch.setattr(module, "differences", differences)
     monkeypatch.setattr(module, "propose", lambda *_: (did.append("propose"), proposal)[1])
     monkeypatch.setattr(module, "sentence", lambda _calibration: "fits")
     run._adopted = lambda *_: (did.append("adopt"), proposal)[1]
