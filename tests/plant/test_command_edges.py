@@ -420,6 +420,45 @@ def test_an_office_signs_for_so_many_seconds_and_prints_a_line_each(
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("by_folder", [True, False])
+def test_an_office_follows_its_registry_and_no_folder_and_ends_at_sigterm(
+    home: Path, job: Any, monkeypatch: pytest.MonkeyPatch, by_folder: bool
+) -> None:
+    places, opened, closed, handlers = iter(["one", "two", "two"]), list[Any](), list[str](), dict[int, Any]()
+    waits, unlocked, timers = list[tuple[float, float]](), list[bool](), list[object]()
+
+    def wait(most: float, look: float) -> None:
+        waits.append((most, look))
+        if len(waits) == 3:
+            handlers[signal.SIGTERM](signal.SIGTERM, None)
+
+    def office_inbox(_station: Any, files: Path | None, stack: Any) -> Any:
+        opened.append(files)
+        place = ("one", "two")[len(opened) - 1]
+        stack.callback(closed.append, place)
+        return place, SimpleNamespace(where=place), SimpleNamespace(wait=wait)
+
+    used = list[str]()
+
+    def answers(_station: Any, transport: Any, _inbox: Any, _jobs: Any, *, stop: Any) -> Iterator[Any]:
+        used.append(transport.where)
+        return iter(())
+
+    unlock = Station.unlock
+    monkeypatch.setattr(Station, "unlock", lambda station: unlocked.append(True) or unlock(station))
+    monkeypatch.setattr(of_line, "_office_inbox", office_inbox)
+    monkeypatch.setattr(plant.connecting, "place_of", lambda _: next(places))
+    monkeypatch.setattr(plant.office, "answer_all", answers)
+    monkeypatch.setattr(of_line.signal, "signal", lambda number, handler: handlers.update({number: handler}))
+    monkeypatch.setattr(of_line.threading, "Timer", lambda *given: timers.append(given))
+    done = call(home, "signer", "run", "--job", "0b5f", *(("--files", home) if by_folder else ()))
+    assert (done.code, done.out, done.err) == (0, "", "Signing for 1 job; Ctrl-C ends it.\n")
+    assert (opened, used) == (([home], ["one"] * 3) if by_folder else ([None] * 2, ["one", "two", "two"]))
+    assert closed == (["one"] if by_folder else ["one", "two"])
+    assert (waits, timers) == ([(1.0, 0.2)] * 3, [])
+    assert len(unlocked) >= 4, "before the first one and at each turn: the passphrase may be another one by then"
+
+
 def test_an_office_answers_one_file_with_an_answer_or_a_signed_image(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

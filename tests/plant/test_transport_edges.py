@@ -1071,6 +1071,14 @@ def test_a_keeper_vouches_for_authentic_datasheets_of_who_may_not_sign(
     )  # fmt: skip
     monkeypatch.undo()
     assert (membership.vouch(station, found), station.plant.unsent()) == (1, 1)
+    me = station.fingerprint
+    words = list[tuple[str, int, bool]]()
+    monkeypatch.setattr(
+        station.plant.claims, "signers", lambda digest: words if digest == hashlib.sha256(b"gone").digest() else []
+    )
+    for known, fresh in (((WEST, 3, True), 1), ((me, 3, False), 1), ((me, 3, True), 0)):
+        words[:] = [known]
+        assert membership.vouch(station, found) == fresh, "what this station vouched for already is not stated again"
 
 
 # -- beside the service ------------------------------------------------------------------------------------------------
