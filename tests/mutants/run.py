@@ -10,6 +10,9 @@ A mutant whose tests did not come to their end is no survivor: nothing is known 
 mutant, they run once without it, on the machine as busy as it is, and once more with twice the time that this took.
 Those that still do not end are listed apart, and kept in build/mutants/unfinished.txt.
 
+Without --patterns, at most half of the mutants are rules, drawn by chance where there are more; all of them take hours:
+--patterns --count 1000 --minutes 300.
+
 Usage: python -m tests.mutants.run [--count N] [--room ROOM] [--only WORDS] [--minutes M] [--jobs J] [--seed S]
 [--patterns]
 Exits 1 where a pattern survived, 2 where one is not found in the code, 3 where the tests of one did not come to their
@@ -223,6 +226,11 @@ class Bench:
         return good
 
 
+def among(named: list[Mutant], most: int, chance: random.Random) -> list[Mutant]:
+    """Return the rules' mutants, or ``most`` of them by chance: of each room, in C and in scripts, as they are many."""
+    return named if len(named) <= most else chance.sample(named, most)
+
+
 def drawn(count: int, room: str, chance: random.Random) -> list[Mutant]:
     """Random mutants: a module by its weight, then any of it; none twice."""
     every = [mutant for module in modules(room) for mutant in any_of(module)]
@@ -264,11 +272,10 @@ def main(arguments: list[str]) -> int:
         named += [mutant for pattern in C_PATTERNS for mutant in found_in_c(pattern)]
     if chosen.room in ("", "ncap", "ncap/page"):
         named += [mutant for pattern in SCRIPT_PATTERNS for mutant in found_in_c(pattern)]
-    others = (
-        []
-        if chosen.patterns or chosen.room == IN_C
-        else drawn(max(0, chosen.count - len(named)), chosen.room, random.Random(seed))
-    )
+    chance, without_random = random.Random(seed), chosen.patterns or chosen.room == IN_C
+    if not chosen.only:
+        named = among(named, chosen.count if without_random else chosen.count // 2, chance)
+    others = [] if without_random else drawn(max(0, chosen.count - len(named)), chosen.room, chance)
     if chosen.only:
         named = [mutant for mutant in named if chosen.only == mutant.function or chosen.only in mutant.rule]
         every = [] if chosen.patterns else [mutant for module in where for mutant in any_of(module)]

@@ -12,7 +12,7 @@ import pytest
 from tests.mutants.changes import ROOT, Module, Mutant, Pattern, any_of, found, found_in_c, modules
 from tests.mutants.nearest import Suite
 from tests.mutants.patterns import C_PATTERNS, PATTERNS, SCRIPT_PATTERNS
-from tests.mutants.run import MOST, Bench, Copy, Fate, Ran, drawn, report
+from tests.mutants.run import MOST, Bench, Copy, Fate, Ran, among, drawn, report
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,16 @@ def test_what_chance_draws_is_python_that_says_something_else(house: list[Module
     for mutant in drawn(40, "measure", random.Random(7)):
         without, with_it = both(mutant, by_name[mutant.path])
         assert without != with_it, str(mutant)
+
+
+def test_of_more_rules_than_an_hour_has_time_for_others_are_tried_each_time() -> None:
+    """The first of the list were tried each time, and those of the node in C and of the page never."""
+    rules = [Mutant("rule.py", number, number, "", "rule", 1, str(number)) for number in range(800)]
+    assert among(rules[:150], 150, random.Random(1)) == rules[:150]
+    first, second = (among(rules, 150, random.Random(seed)) for seed in (1, 2))
+    assert (len(set(first)), len(set(second))) == (150, 150)
+    assert first != second
+    assert any(mutant.start > 700 for mutant in first)
 
 
 def test_the_nearest_tests_of_a_module_come_first(house: list[Module]) -> None:
