@@ -428,8 +428,14 @@ def test_an_open_job_is_asked_again_and_its_bars_are_as_long_as_its_numbers(stag
     assert [entry["path"] for entry in stage.sent] == ["jobs", "jobs/j"]
     assert stage.run(bars)[:3] == [[["good", 30]], [["good", 40]], [["", 50]]]
     assert texts(stage, ".station-part h4") == ["north"]
-    stage.page.get_by_text("fingers").click()
-    stage.page.get_by_text("first pass").first.wait_for(state="hidden")
+    stage.run(
+        """
+        const details = document.querySelector(".jobs details");
+        const folded = new Promise((done) => details.addEventListener("toggle", done, { once: true }));
+        details.open = false;
+        await folded;
+        """
+    )
     stage.pass_time(10_000)
     assert [entry["path"] for entry in stage.sent] == ["jobs"], "a closed one is not asked"
     stage.answers(**{"GET jobs": {"refused": 503}})
