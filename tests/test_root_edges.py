@@ -128,7 +128,12 @@ def test_a_core_that_is_taken_offline_ends_the_watch_and_gives_all_cores_back(lo
     kernel = Kernel({0, 1}, lost)
     kept = OneCore(cast("Any", kernel))
     pauses = list[float]()
-    kept._end = cast("Any", SimpleNamespace(wait=pauses.append, set=lambda: None))
+
+    def wait(pause: float) -> bool:
+        pauses.append(pause)
+        return len(pauses) > 3  # so that a watch that goes on ends, too
+
+    kept._end = cast("Any", SimpleNamespace(wait=wait, set=lambda: None))
     kept._run()
     assert kept.left
     assert kernel.placed == [{0, 1}]
