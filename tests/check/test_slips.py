@@ -433,3 +433,9 @@ def test_s_is_high_above_half_of_the_group_order_only() -> None:
     half = GROUP_ORDER // 2
     assert not slips.high_s(bytes(32) + half.to_bytes(32, "big"))
     assert slips.high_s(bytes(32) + (half + 1).to_bytes(32, "big"))
+
+
+def test_the_counter_after_the_last_is_0() -> None:
+    """c of Open has 64 bits; a node that counts too early has the next one in its mac."""
+    found = [slips._next(bytes.fromhex(text)).hex() for text in ("00" * 8, "7f" + "ff" * 7, "ff" * 8)]
+    assert found == ["00" * 7 + "01", "80" + "00" * 7, "00" * 8]

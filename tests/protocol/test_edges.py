@@ -15,7 +15,7 @@ from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.announce import AddressClaim, Announce
 from teds_provision.protocol.handover import bundle as bundles
-from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover import jose, strict_json
 from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_pieces
 from teds_provision.protocol.handover.strict_json import base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem, node_key_message, to_pem, verify_each_once
@@ -213,3 +213,44 @@ def test_an_update_without_cbor2_says_what_to_install(monkeypatch: pytest.Monkey
         smp.decode_map(b"\xa0")
     assert no.value.message == "Firmware updates need the package cbor2."
     assert "[update]" in (no.value.hint or "")
+
+
+LONG = '"' + "x" * 70_000 + '"'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '\ufeff{"nodes":[]}', '\ufeff[]', '{"nodes":[1,2]', '{"nodes":[1 2]}', '{"nodes":[1,]}', '{"nodes":[],}',
+        '{"nodes":[]}x', '{"nodes":[]} {}', '{"a":1,"a":2}', '{"nodes":[],"nodes":[]}', '{a:1}', '{"a" 1}', '{"a":}',
+        '{"a":01}', '{"a":NaN}', '{"a":1.5.5}', '{"nodes":[' + LONG + ',',
+        "", " ", '{"a":"\x01"}',
+    ],
+)  # fmt: skip
+def test_a_long_object_is_json_to_its_last_character(text: str) -> None:
+    with pytest.raises(BadDataError, match="The bundle"):
+        strict_json.load_long(bytearray(text.encode()), "The bundle", "nodes", lambda value: value)
+
+
+@pytest.mark.parametrize("text", ["[]", "1", '"a"', "null", " [1, 2] "])
+def test_a_long_value_that_is_no_object_is_named_so(text: str) -> None:
+    with pytest.raises(BadDataError) as no:
+        strict_json.load_long(bytearray(text.encode()), "The bundle", "nodes", lambda value: value)
+    assert no.value.message == "The bundle is JSON, but not an object."
+
+
+def test_elements_of_a_long_list_are_made_one_by_one_and_the_octets_are_used_up() -> None:
+    text = ' {"a" : {"nodes":[1]}, "nodes" : [1, [2], ' + LONG + ' , {"b":null} ] , "c":[3],\n"d":-1.5e+10 } '
+    octets = bytearray(text.encode())
+    found = strict_json.load_long(octets, "The bundle", "nodes", lambda value: (value,))
+    assert found == {
+        "a": {"nodes": [1]},
+        "nodes": [(1,), ([2],), ("x" * 70_000,), ({"b": None},)],
+        "c": [3],
+        "d": -1.5e10,
+    }
+    assert octets == b""
+    empty = strict_json.load_long(bytearray(b'{"nodes":[]}'), "The bundle", "nodes", lambda value: value)
+    assert empty == {"nodes": []}
+    other = strict_json.load_long(bytearray(b'{"nodes":{"a":1}}'), "The bundle", "nodes", lambda value: value)
+    assert other == {"nodes": {"a": 1}}
