@@ -730,6 +730,19 @@ def test_on_trial_nothing_stored_changes_until_it_is_confirmed() -> None:
     assert desk.node.identity().state == 0
 
 
+def test_a_reset_by_hand_in_factory_state_writes_nothing() -> None:
+    """Flash wears, and a button may be pressed all day."""
+    desk = Board.make()
+    desk.node.garble(0)
+    desk.node.reset_by_hand()
+    assert (desk.node.written, desk.node.identity().state) == (0, 0)
+    desk.keyed()
+    desk.node.garble(0)
+    desk.node.reset_by_hand()
+    assert desk.node.written > 0
+    assert desk.node.identity().state == 0
+
+
 def test_an_unconfirmed_trial_restarts_after_ten_minutes() -> None:
     desk = Board.make().keyed()
     desk.firmware.flags = SIGNED | ON_TRIAL
