@@ -77,6 +77,9 @@ def test_a_card_has_three_values_and_a_tapped_one_is_marked_for_eight_seconds(st
     stage.run("state.values.set(words[0], { value: 0.05, time: words[1], period: 0 })", f"{ARM}/2", now)
     stage.pass_time(250)
     assert texts(stage, ".peek > span")[0] == "n 2 50.00 mm"
+    nodes(stage, gripper(channels=channels, groups=["crane"]), {"uuid": HAND, "name": "other", "present": False})
+    stage.pass_time(20)
+    assert texts(stage, ".peek > span")[0] == "n 2 50.00 mm", "as soon as the card is drawn anew"
     marked = """
       const marks = [".card a[aria-current=true] .name", ".card.tapped .name", ".card.absent .name", ".peek > .stale"];
       return marks.map((one) => [...document.querySelectorAll(one)].map((each) => each.innerText.trim()));

@@ -54,6 +54,7 @@ export function nodesView(main, rest) {
     const shown = state.total > state.nodes.size ? `${state.nodes.size} of ${count(state.total, "node")}` : count(state.nodes.size, "node");
     text(total, `${filters.on ? `${nodes.length} of ` : ""}${shown}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
     keyed(list, nodes.slice(0, drawn), (node) => node.uuid, (node) => card(node, bulk), update);
+    values(); // a card that was filled anew has none
     more.hidden = nodes.length <= drawn;
     text(more.lastChild, `Show ${Math.min(DRAWN, nodes.length - drawn)} more of ${nodes.length}`);
     main.classList.toggle("one-open", Boolean(chosen[0]) && any);
