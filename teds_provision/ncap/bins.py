@@ -71,7 +71,8 @@ class Bins(SegmentedBins):
     """A ring of bins of one width, by their number. The newest is ``newest``; those before it stay ``size``.
 
     ``coarse``: the greatest value is kept as the distance from the least, rounded up to 8 bits of mantissa (0.4 % of
-    the distance, 0.8 at most), and counts end at 255: half the memory. Else both are Float32, counts end at 65535.
+    the distance, 0.8 at most, and once more each time that the least value falls), and counts end at 255: half the
+    memory. Else both are Float32, counts end at 65535.
     """
 
     def __init__(self, width: float, size: int, *, coarse: bool) -> None:
