@@ -250,3 +250,13 @@ def test_a_text_with_a_byte_order_mark_is_refused_with_its_place() -> None:
         limits._parsed('\ufeff{"a": 1}')
     assert (error.value.pos, error.value.msg) == (0, "Unexpected UTF-8 BOM (decode using utf-8-sig)")
     assert limits._parsed(b'\xef\xbb\xbf{"a": 1}'.decode("utf-8-sig")) == {"a": 1}
+
+
+def test_work_is_shared_only_among_processes_that_can_inherit_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {0, 2, 5}, raising=False)
+    assert portable.cores_to_share() == 3
+    with monkeypatch.context() as without:
+        without.delattr(os, "fork")
+        assert portable.cores_to_share() == 1
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert portable.cores_to_share() == 1

@@ -134,6 +134,14 @@ def test_a_sample_is_printed_whole(
     assert third["text"] == "closed"
 
 
+def test_an_uncertainty_has_three_digits() -> None:
+    for uncertainty, shown in ((0.0123456, "0.0123"), (1234.5, "1.23e+03"), (0.5, "0.5"), (None, "")):
+        console = Console(file=io.StringIO(), width=120)
+        sample_command._samples(console, [Sample(1, "force", 7.0, "N", 9, uncertainty, True, 1795341600.5)])
+        row = console.file.getvalue().splitlines()[1].split()  # type: ignore[attr-defined]
+        assert row == ["1", "force", row[2], *([shown] if shown else []), "N", "9"]
+
+
 def test_values_of_a_node_that_was_revoked_meanwhile_are_not_printed(
     home: Path, session: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -275,6 +275,9 @@ def test_the_sum_of_a_batch_for_people(running: Any) -> None:
     none = BatchTotals(0, 0, 0, 0.0, None, {})
     people, _ = running(Run(sum=none), "--batch", "boards.csv", "--yes")
     assert people.out == "0 passed, 0 failed, 0 skipped, 0.0 s in total.\n"
+    never = BatchTotals(3, 0, 0, 9.0, 0.0, {})
+    people, _ = running(Run(sum=never), "--batch", "boards.csv", "--yes")
+    assert people.out == "3 passed, 0 failed, 0 skipped, 0.0% at the first attempt, 9.0 s in total.\n"
 
 
 def test_boards_of_a_bus_have_a_line_each_and_warnings_are_printed_once(running: Any) -> None:

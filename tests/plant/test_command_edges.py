@@ -11,6 +11,7 @@ from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from uuid import UUID
 
 import pytest
 
@@ -130,6 +131,26 @@ def test_a_draft_is_shown_before_it_is_signed(home: Path, tmp_path: Path) -> Non
     assert not out.exists()
     assert call(home, "registry", "sign", draft, "--output", out).code == 6, "nobody is there to confirm"
     assert not out.exists()
+
+
+def test_all_of_a_draft_of_another_registry_is_shown_and_it_is_not_taken_here(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draft, compared = tmp_path / "roster.draft", list[Any]()
+    assert call(home, "registry", "remove", "west", "--retired", "--draft", draft).code == 0
+    changes = plant.owner.changes
+    monkeypatch.setattr(plant.owner, "changes", lambda before, after: compared.append(before) or changes(before, after))
+    for registry, same in ((None, True), (lambda made: replace(made, registry=str(UUID(int=7))), False)):
+        read = plant.owner.read_draft
+        if registry is not None:
+            monkeypatch.setattr(plant.owner, "read_draft", lambda *words, read=read: registry(read(*words)))  # noqa: B023
+        call(home, "registry", "sign", draft, "--output", tmp_path / "o", "--dry-run")
+        assert (compared.pop() is not None) is same
+
+
+def test_the_log_of_the_plant_shows_what_is_zero_or_false() -> None:
+    event = {"act": "grouped", "at": "x", "id": "y", "group": "hand", "member": False, "n": 0, "why": None, "text": ""}
+    assert commands._members(event) == "group=hand member=False n=0 text="
 
 
 def test_who_is_not_in_the_roster_is_named_with_the_way_to_see_who_is(home: Path, tmp_path: Path) -> None:

@@ -408,6 +408,10 @@ def test_who_may_be_added_to_a_roster(station: Station, monkeypatch: pytest.Monk
     refused(request(station, new, "west"), "There is already a member called 'west'")
     line: Any = frozenset({"line"})
     assert owner.says_the_same(now, owner.add(station, request(station, key), line)), "the same again"
+    once = replace(west, signed=(7, "ab" * 32))
+    still = held(station, once, removed=(gone,))
+    assert owner.says_the_same(still, owner.add(station, request(station, key), line)), "also one that lost sign"
+    now = held(station, west, removed=(gone,))
     for clock in (now.created, now.created - timedelta(days=300)):
         monkeypatch.setattr(owner, "now", lambda clock=clock: clock)
         day = timedelta(hours=24)

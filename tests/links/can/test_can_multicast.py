@@ -182,3 +182,37 @@ def test_a_stamp_after_the_wall_clock_was_set_counts_as_none(seconds: float) -> 
     ancillary = [(socket.SOL_SOCKET, multicast._TIMESTAMPNS, multicast._STAMP.pack(*divmod(stamp, 10**9)))]
     before = time.monotonic()
     assert before <= multicast.arrival(ancillary) <= time.monotonic()
+
+
+class SocketOnPaper:
+    """Stands for a socket of either family, as many machines have no IPv6: keeps what it was set to."""
+
+    def __init__(self, family: int, kind: int) -> None:
+        self.course: list[object] = [(family, kind)]
+
+    def setsockopt(self, *words: int) -> None:
+        self.course.append(words)
+
+    def connect(self, place: tuple[str, int]) -> None:
+        self.course.append(place)
+
+    def setblocking(self, blocking: bool) -> None:
+        self.course.append(blocking)
+
+
+@pytest.mark.parametrize(
+    ("family", "group", "level", "option"),
+    [
+        (socket.AF_INET, "239.74.163.2", socket.IPPROTO_IP, socket.IP_MULTICAST_TTL),
+        (socket.AF_INET6, "ff01::7a:1", socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS),
+    ],
+)
+def test_the_hop_limit_bounds_how_far_frames_go(
+    family: int, group: str, level: int, option: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multicast.socket, "socket", SocketOnPaper)
+    for hops in (0, 3):
+        sender = multicast._sender(family, group, 43113, hops)
+        assert sender.course == [  # type: ignore[attr-defined]
+            (family, socket.SOCK_DGRAM), (level, option, hops), (group, 43113), False,
+        ]  # fmt: skip
