@@ -61,12 +61,13 @@ class BleServer:
             ) from error
 
     def stop(self) -> None:
-        """End; never raises."""
+        """End; never raises. Does nothing before the start and after the end."""
+        if not self._thread.is_alive():
+            return  # its loop would never do the work
         with suppress(Exception):
             self._run(self._close(), _OPEN_SECONDS)
         self._loop.call_soon_threadsafe(self._loop.stop)
-        if self._thread.ident is not None:
-            self._thread.join(timeout=3)
+        self._thread.join(timeout=3)
 
     def tapped(self) -> None:
         """Handle a tap of the node."""
