@@ -878,3 +878,17 @@ def test_what_a_session_begins_with_counts_under_its_key_alone(monkeypatch: pyte
     with pytest.raises(LinkError):
         session.run()
     assert session.supervisor._proven is sealed, "a session that could not be opened counts as well"
+
+
+@pytest.mark.parametrize(
+    ("asked", "nodes", "lease"), [(2, 0, 2), (2, 10, 2), (2, 11, 3), (2, 12, 3), (2, 15, 3), (2, 16, 4), (9, 16, 9)]
+)
+def test_a_lease_is_no_shorter_than_a_fifth_of_a_second_for_each_node_of_the_bus(
+    asked: int, nodes: int, lease: int
+) -> None:
+    own: Any = SimpleNamespace(
+        _request=SimpleNamespace(lease=asked), bus=SimpleNamespace(share=SimpleNamespace(nodes=nodes))
+    )
+    assert NodeSupervisor._lease_now(own) == lease
+    own.bus = None
+    assert NodeSupervisor._lease_now(own) == asked
