@@ -238,3 +238,12 @@ def test_a_node_that_falls_silent_is_named_with_rule_and_command() -> None:
     rule.run = garbled
     with pytest.raises(GarbledError, match="torn"):
         _Run._tried(rig, rule)
+
+
+@pytest.mark.parametrize(("home", "now"), [(0, 17), (17, 17)])
+def test_a_node_whose_address_was_not_moved_is_not_moved_back(home: int, now: int) -> None:
+    """Address 0 would be asked of it, and waited for."""
+    probe: Any = SimpleNamespace(home_address=home, identity=lambda: SimpleNamespace(can_address=now))
+    with pytest.raises(NotApplicableError) as no:
+        session_rules.address_back(probe)
+    assert str(no.value) == "The rule address-moves moved no address."

@@ -9,6 +9,7 @@ from typing import cast
 
 import pytest
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from lxml import etree
 
 from teds_provision.errors import BadDataError, NotAuthenticError
@@ -257,3 +258,24 @@ def test_a_signature_by_someone_unknown_states_what_was_not_checked_either() -> 
     unknown = read(signer().sign(ANGLE)).unchecked
     assert unknown[0] == "The signer is not known: name the certificate with --trust-dcc."
     assert "revocation" in unknown[1]
+
+
+@pytest.mark.parametrize("damage", [ValueError("no DER"), UnsupportedAlgorithm("a key of a new kind")])
+def test_a_signers_certificate_that_cannot_be_read_makes_the_signature_one_that_cannot_be_checked(
+    damage: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The library reads a certificate piece by piece, and meets an unknown key only when it is asked for it."""
+    lab = signer()
+    signed = lab.sign(ANGLE)
+
+    class Damaged:
+        subject = issuer = not_valid_before_utc = not_valid_after_utc = None
+
+        def public_key(self) -> object:
+            raise damage
+
+    monkeypatch.setattr(x509, "load_der_x509_certificate", lambda _octets: Damaged())
+    why = "The signature cannot be checked: a certificate in it cannot be read."
+    assert read(signed).unchecked[0] == why
+    with pytest.raises(NotAuthenticError, match="a certificate in it cannot be read"):
+        read(signed, lab.certificate)
