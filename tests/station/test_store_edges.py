@@ -599,3 +599,36 @@ def test_a_damaged_table_ends_the_halving(monkeypatch: pytest.MonkeyPatch) -> No
     assert drawn(1, 9, 4, 1, lower=True) == 1
     assert drawn(1, 9, 7, 9, lower=False) == 9
     assert drawn("a", "b", "b", lower=False) == "b", "texts that are close have no middle: the last one is taken"
+
+
+@pytest.mark.parametrize("after", range(1, 12))
+def test_a_store_that_another_process_makes_at_this_moment_is_ours(
+    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its number and its mark were read one after the other: two inits at once, and one was told of another program."""
+    plain, count = Database.execute, 0
+
+    def execute(self: Database, statement: str, values: Any = ()) -> Any:
+        nonlocal count
+        count += 1
+        if count == after:
+            with monkeypatch.context() as undisturbed:
+                undisturbed.setattr(Database, "execute", plain)
+                Store.open(tmp_path / "home", create=True).close()
+        return plain(self, statement, values)
+
+    monkeypatch.setattr(Database, "execute", execute)
+    Store.open(tmp_path / "home", create=True).close()
+    assert count >= after
+
+
+def test_a_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    Store.open(home, create=True).close()
+    [file] = [path for path in home.iterdir() if path.suffix == ".sqlite3"]
+    for mark, version in ((7, 15), (7, 0), (0, 15)):
+        with closing(sqlite3.connect(file)) as other:
+            other.execute(f"PRAGMA application_id={mark}")
+            other.execute(f"PRAGMA user_version={version}")
+        with pytest.raises(StoreError, match="is a database of another program"):
+            Store.open(home, create=True)

@@ -303,8 +303,9 @@ class Database(Connection):
                 return
 
     def _version(self) -> int:
-        (mark,), (version,) = self.execute("PRAGMA application_id")[0], self.execute("PRAGMA user_version")[0]
+        (version,) = self.execute("PRAGMA user_version")[0]
         tables = self.execute("SELECT count(*) FROM sqlite_schema")[0][0]
+        (mark,) = self.execute("PRAGMA application_id")[0]  # last: another process may set all three meanwhile
         if (version or tables) and mark != APPLICATION_ID:
             raise StoreError(f"{self.path} is a database of another program.", hint="Choose another --home.")
         if 0 < version < OLDEST_SCHEMA:
