@@ -59,8 +59,11 @@ compiled: $(VENV)/.dev
 
 # The inner loop: the rooms without a link or a process, the rules of the house, one case of each link, one provisioning
 # by command. CONTRIBUTING.md says what that leaves out.
-QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/station tests/provisioning tests/trace \
-  tests/measure/test_clock.py tests/measure/test_grid.py tests/measure/test_lookout.py \
+# These wait for seconds of the clock.
+WAITING := tests/test_one_core.py tests/provisioning/test_identify_at.py
+QUICK := $(filter-out $(WAITING),$(wildcard tests/test_[!m]*.py tests/provisioning/test_*.py)) \
+  tests/teds tests/protocol tests/station tests/trace \
+  tests/measure/test_clock.py tests/measure/test_grid.py \
   'tests/links/nfc/test_nfc_exchange.py::test_frames_of_every_size_come_back_whole[4]' \
   tests/links/can/test_can_exchange.py::test_a_node_answers_an_fd_station_in_fd_and_a_classic_one_in_classic \
   tests/links/ble/test_port.py::test_the_address_may_be_named \
