@@ -93,7 +93,7 @@ def test_a_folder_that_cannot_be_made_is_named_with_its_cause(tmp_path: Path) ->
 
 
 class Kernel:
-    """Two cores, on which others do nothing; ``lost`` is raised when somebody looks."""
+    """Two idle cores; ``lost`` is raised when the load is read."""
 
     def __init__(self, cores: set[int], lost: Exception | None = None) -> None:
         self.cores, self.lost, self.placed, self.looks = cores, lost, list[set[int]](), 0

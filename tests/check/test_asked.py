@@ -1,10 +1,10 @@
-"""Every rule asks the reference node what ``asked.txt`` has, gets the replies there, and says what it saw.
+"""Every rule sends the requests of ``asked.txt`` to the reference node, gets the replies there, and reports them.
 
 A rule that leaves out one of its cases still passes on a good node, and finds the one fault of the table: this file
 holds what it asks. A line is a rule, what it saw, and its commands: ``channel:class.function/access code+octets`` of
-the payload, the payload itself where it is this rule's and nothing random (of a long one the first octets and a
-checksum), ``=reason`` of a refusal, ``[…]`` in a session, ``x3`` three times in a row. Who changes a rule writes the
-file anew, and reads what changed: ``python -m tests.check.test_asked``.
+the payload, the payload itself if it is specific to the rule and not random (of a long one the first octets and a
+checksum), ``=reason`` of a refusal, ``[…]`` in a session, ``x3`` three times in a row. After a change of a rule,
+rewrite the file and review the difference: ``python -m tests.check.test_asked``.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def _sheet(probe: Probe, teds: bytes) -> str:
 
 
 def _shown(probe: Probe, command: Command, *, inside: bool, counter: bytes) -> str:
-    """Return the payload, "" where it is as the command has it everywhere, or has something random in it."""
+    """Return the payload, "" if it is the same for every rule or contains random octets."""
     kind, payload = (command.command_class, command.function), command.payload
     if kind == (128, 1) and len(payload) == 259:
         return _request(payload)

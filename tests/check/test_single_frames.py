@@ -608,7 +608,7 @@ def test_a_claim_that_shows_nothing_is_not_tried(
 def test_frames_for_other_stations_of_other_nodes_and_without_octets_are_passed_over(
     clock: Callable[[Node], None],
 ) -> None:
-    """What comes beside the node's own frames: an Announce, data, a reply to another base station, an empty frame."""
+    """Frames other than the node's replies: an Announce, data, a reply to another base station, an empty frame."""
     node = Node()
     noise = [
         BusFrame(0x1CFF0044, bytes.fromhex("0101000000010000"), 0.0),

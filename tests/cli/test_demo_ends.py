@@ -138,7 +138,7 @@ def test_a_node_of_the_demo_is_ready_once_it_has_printed_its_uuid(line: str, uui
 
 
 class Child:
-    """Stands for a process that prints what it is given; ``ends``: it ends when it is told to."""
+    """Mock process that prints the given lines; ``ends``: it exits on a signal."""
 
     def __init__(self, patch: pytest.MonkeyPatch, output: bytes, *, ends: bool = True, over: bool = False) -> None:
         self.output, self.ends, self.over, self.course = output, ends, over, list[str]()

@@ -25,7 +25,7 @@ BUS = ("--can", "virtual:measuring")
 
 
 class Asked:
-    """What the last command asked for: stands for the measurement, which ends at once."""
+    """Mock measurement that ends at once and keeps the request of the last command."""
 
     def __init__(self) -> None:
         self.kept: KeptMeasurement | None = None

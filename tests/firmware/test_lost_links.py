@@ -1,4 +1,4 @@
-"""What goes with a link of the node in C and with no other: stored reply, session, half-open Open, Request."""
+"""State that ends with one link of the C node and with no other: stored reply, session, half-open Open, Request."""
 
 from __future__ import annotations
 

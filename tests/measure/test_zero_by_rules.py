@@ -1,4 +1,4 @@
-"""What `calibrate zero` and `calibrate capture` refuse and warn of, at a node that is a mock."""
+"""Refusals and warnings of `calibrate zero` and `calibrate capture`; the node is a mock."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def test_a_cookie_that_nobody_can_read_is_none(tmp_path: Path, cookie: str) -> N
 
 
 def test_what_is_no_request_passes_the_guard(tmp_path: Path) -> None:
-    """Servers tell applications of their start and end in the same way, without headers."""
+    """ASGI servers report their start and end by the same call, without headers."""
     came: list[str] = []
 
     async def any_app(scope: Scope, _receive: Receive, _send: Send) -> None:

@@ -156,7 +156,7 @@ def test_a_bin_counts_to_its_end_and_no_further() -> None:
 
 @dataclass
 class _Bin:
-    """What a bin should hold."""
+    """Expected content of a bin."""
 
     segment: int
     values: list[float] = field(default_factory=list)
@@ -164,7 +164,7 @@ class _Bin:
 
 
 class _PlainBins:
-    """What bins are to hold, without a ring: a dictionary of all samples that count."""
+    """Reference for the rings: a dictionary of all samples that count."""
 
     def __init__(self, size: int) -> None:
         self.size, self.newest = size, -1

@@ -831,7 +831,7 @@ def test_a_waiting_node_that_has_gone_is_shown_no_more(service: Service, monkeyp
 def test_only_a_store_that_fails_while_values_come_is_waited_for(
     service: Service, monkeypatch: pytest.MonkeyPatch, error: Exception, phase: Phase, state: str
 ) -> None:
-    """Whatever else fails ends that measurement, and its reason stays to be seen."""
+    """Any other error ends that measurement; its reason remains visible."""
     running, looked = listed(service, NODE), threading.Event()
     running.phase, running.state = phase, "waiting"
     running.over.clear()

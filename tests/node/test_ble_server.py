@@ -23,7 +23,7 @@ NODE: Any = object()
 
 
 class Controller:
-    """What happens at the controller, in order; ``fails`` raises where it is named, ``slow`` is never done there."""
+    """Calls of the controller, in order; a step in ``fails`` raises its error, the step ``slow`` times out."""
 
     def __init__(self) -> None:
         self.done: list[Any] = []

@@ -205,7 +205,7 @@ def _split(frame: str) -> tuple[int, str]:
 
 
 def test_two_nodes_of_one_process_that_meet_part(clock: list[float]) -> None:
-    """What one sends the other hears, though it does not come from the bus."""
+    """Two servers of one process receive each other's frames, which do not come back from the bus."""
     low, high, beside = Node(), Node(uuid=HIGH), Node(0x22, bytes(10))
     server = Quiet(clock, low, high, beside)
     server.send_data(cast("Any", beside), 0x1CFE0022, b"data", fd=False)

@@ -1,7 +1,7 @@
-"""What a screen reader is given of each view: roles, names, order, what is pressed, checked or disabled.
+"""Accessibility tree of each view: roles, names, order, and what is pressed, checked or disabled.
 
 Each view stands in ``aloud/VIEW.yaml`` as the browser's accessibility tree, so whatever is left out of a view, or loses
-its name, differs. After a change that is meant, write them anew with ``ALOUD=write pytest tests/page/test_aloud.py``,
+its name, differs. After a change that is meant, rewrite them with ``ALOUD=write pytest tests/page/test_aloud.py``,
 and read the difference.
 """
 
@@ -251,7 +251,7 @@ CLASSES = """
 
 
 class Seen(NamedTuple):
-    """What a view gave, and what came after it was left: requests, errors, or another look."""
+    """Content of a view, and effects after it was left: requests, errors, or another appearance."""
 
     aloud: str
     classes: set[str]
@@ -259,7 +259,7 @@ class Seen(NamedTuple):
 
 
 def look_at(stage: Stage, show: Callable[[Stage], None]) -> Seen:
-    """Show a view and leave it; then let the station say something else of all, for longer than any view waits."""
+    """Show a view and leave it; then change the whole state, for longer than any view waits."""
     stage.reset()
     show(stage)
     stage.pass_time(20)

@@ -1,4 +1,4 @@
-"""What the plot draws: its axes, its marks, the moment under the pointer, a stretch that was chosen, and how often."""
+"""The plot: axes, marks, the moment under the pointer, a selected span, and the drawing rate."""
 
 from __future__ import annotations
 

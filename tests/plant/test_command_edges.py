@@ -1,4 +1,4 @@
-"""What the commands of the plant and the line refuse or warn of, with the cure, and what each choice runs."""
+"""Refusals and warnings of the plant's and the line's commands with their remedies, and the effect of each option."""
 
 from __future__ import annotations
 

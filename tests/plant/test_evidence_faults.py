@@ -321,7 +321,7 @@ def test_evidence_has_at_most_a_mebibyte() -> None:
     ],
 )  # fmt: skip
 def test_facts_hold_texts_whole_numbers_lists_and_null(value: object, plain: bool) -> None:
-    """What RFC 8785 spells in one way; numbers of 32 bits, four levels deep with the facts themselves."""
+    """JSON with one spelling in RFC 8785; numbers of 32 bits, four levels deep including the facts."""
     if plain:
         codec._require_plain({"a": value})
         return

@@ -372,7 +372,7 @@ def test_what_the_pins_or_the_guard_refuse_is_answered_with_their_reason(
 
 
 def test_an_office_answers_in_turn_and_takes_away_what_it_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One from the future stays, that of a station that left is answered to nobody, a foreign one is thrown away."""
+    """A request from the future stays, one of a removed station gets no answer, a foreign one is discarded."""
     notices, sent, gone = list[str](), list[tuple[str, bytes, str]](), list[str]()
     roster = SimpleNamespace(point_of=lambda _: b"", member=lambda digits: digits if digits == "west" else None)
     station: Any = SimpleNamespace(notice=notices.append, point=b"point")

@@ -1,4 +1,4 @@
-"""What stations of a plant do with documents that did not come, came twice, or are none; and whom they answer."""
+"""Documents that are missing, arrive twice or are malformed, and who gets an answer."""
 
 from __future__ import annotations
 
@@ -1085,7 +1085,7 @@ def test_a_keeper_vouches_for_authentic_datasheets_of_who_may_not_sign(
 
 
 def test_a_folder_that_becomes_a_database_is_listened_to(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a station that left the registry meanwhile says nothing of its last sync."""
+    """A station that left the registry meanwhile reports no last sync."""
     said = list[dict[str, str]]()
     watch = service.PlantWatch(station, cast("Any", stub(event=lambda _of, **facts: said.append(facts))), lambda: None)
     monkeypatch.setattr(type(station.plant), "joined", None)

@@ -164,7 +164,7 @@ def test_a_bundle_is_no_longer_than_its_receiver_reads() -> None:
 
 
 def test_a_payload_that_is_no_base64url_is_a_fault_only_after_its_signature() -> None:
-    """What nobody signed is not believed, and so not named either."""
+    """An unsigned value is not trusted, so the error does not quote it."""
     head = base64url(dump({"alg": "ES256", "kid": fingerprint(SENDER.point), "typ": TYPE}))
     for text in (b"*", b"QQ=="):
         message = head + b"." + text

@@ -350,7 +350,7 @@ def test_what_is_reported_of_several_channels_is_one_sentence() -> None:
 
 @dataclass
 class OneUnit:
-    """A line that allots one unit, and what it is told of it."""
+    """Mock line that assigns one unit and keeps the reports about it."""
 
     prepared: PreparedOrder
     course: list[Any] = field(default_factory=list)

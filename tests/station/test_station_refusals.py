@@ -1,4 +1,4 @@
-"""What a station refuses, or reads again, before it uses a row of its store: identity, keys, nodes, copies."""
+"""Checks and re-reads of a station before it uses a row of its store: identity, keys, nodes, copies."""
 
 from __future__ import annotations
 
@@ -548,7 +548,7 @@ def test_a_changed_vault_is_read_again_and_nobody_is_asked(station: Station, mon
 
     def open_vault(home: Path, id: str, keystore: str, ask: Any, *, use_agent: bool) -> Any:
         asked.append((home, id, keystore, use_agent))
-        with pytest.raises(VaultError):  # whoever is asked here raises
+        with pytest.raises(VaultError):  # the prompt itself raises
             ask("Passphrase", False)
         if opened is None:
             raise VaultError("nothing holds it open")

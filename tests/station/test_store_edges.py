@@ -1,4 +1,4 @@
-"""What the files of a home do at their edges: another process in between, a place that fails, a row nobody wrote."""
+"""Files of a home in rare cases: another process in between, a failing disk, a row that no version wrote."""
 
 from __future__ import annotations
 
@@ -605,7 +605,7 @@ def test_a_damaged_table_ends_the_halving(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_store_that_another_process_makes_at_this_moment_is_ours(
     after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its number and its mark were read one after the other: two inits at once, and one was told of another program."""
+    """The mark was read before the schema number: of two inits at once, one failed with "another program"."""
     plain, count = Database.execute, 0
 
     def execute(self: Database, statement: str, values: Any = ()) -> Any:

@@ -455,7 +455,7 @@ def test_a_line_without_boundaries_goes_over_raw_values_or_from_limit_to_limit()
 
 
 def test_a_line_without_boundaries_needs_a_raw_range(angle: Profile) -> None:
-    """Samples of floats have none: only what the file or the profile says can bound the line."""
+    """Samples of floats have none: only the file or the profile can bound the line."""
     own = angle.channels[0]
     fields = {**own.fields, "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 24}}
     floats = replace(

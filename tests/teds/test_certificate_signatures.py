@@ -84,7 +84,7 @@ def test_an_expired_signers_certificate_counts_at_the_time_of_signing_and_is_sta
     gone = signer("Expired long ago", (-900, -500))
     with pytest.raises(NotAuthenticError, match="not valid any more"):
         read(gone.sign(ANGLE), gone.certificate)
-    for xades in (True, False):  # of a signer whom nobody vouches for it does not matter since when
+    for xades in (True, False):  # the validity of an untrusted signer's certificate does not matter
         unknown = read(gone.sign(ANGLE, xades=xades))
         assert (unknown.signature, len(unknown.unchecked)) == ("not checked", 2)
         assert unknown.unchecked[0].startswith("The signer is not known")
@@ -206,7 +206,7 @@ def test_a_signature_without_the_signers_certificate_cannot_be_checked() -> None
 
 @pytest.mark.parametrize("found", [[], ["other"], ["root", "root"], ["root", "other", "root"]], ids=str)
 def test_a_signature_covers_the_whole_certificate_once(found: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever signxml takes for the signed parts: one of them is the whole document, or nothing is read."""
+    """One of the parts that signxml reports as signed is the whole document; otherwise nothing is read."""
     lab = signer()
     octets = lab.sign(ANGLE)
     parts = {"root": etree.fromstring(octets), "other": etree.fromstring("<a/>")}

@@ -195,7 +195,7 @@ def test_no_time_at_all_has_no_sign() -> None:
 
 
 def test_field_3_of_a_security_teds_is_no_tedsid() -> None:
-    """There alone type 3 stands behind the TEDSID too (security-teds.md): the encryption."""
+    """Only there does type 3 also follow the TEDSID (security-teds.md): the encryption."""
     octets = teds.compose(128, {"UsedSecScheme": 4, "3": b"\1"})
     assert teds.decode(octets).get("UsedEncAlg") == 1
     with pytest.raises(BadDataError, match="has no field '3'"):

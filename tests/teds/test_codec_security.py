@@ -94,7 +94,7 @@ def test_keys_of_other_people_in_every_form(written: bytes, form: str) -> None:
     ],
 )
 def test_der_is_one_sequence_whose_length_is_that_of_the_rest(octets: str, form: str) -> None:
-    """A short length is one octet below 128; a long one has 1 to 4 octets, whose number the first one says."""
+    """A short length is one octet below 128; a long one has 1 to 4 octets, counted by the first one."""
     assert teds.read_key(bytes.fromhex(octets)).form == form
 
 

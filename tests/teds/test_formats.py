@@ -236,7 +236,7 @@ def test_an_image_needs_a_uuid_and_places():
 
 
 def test_a_document_holds_one_teds_for_each_place():
-    """Those of a channel are of channel 1 if nothing says of which, others of the node; no Security TEDS is taken."""
+    """TEDS of a channel without a number belong to channel 1, others to the node; a Security TEDS is not read."""
     name, calibration = teds.compose(12, {"Format": 0, "TCName": "a"}), teds.compose(5, {"Coefs": [1.0]})
     security = octets_of(_vector("x24_security"))
 

@@ -110,7 +110,7 @@ def test_show_says_that_the_node_is_wrapped() -> None:
 
 
 def test_show_says_of_other_lines_that_they_are_none_of_the_profile() -> None:
-    """Whoever reads them is not told that the node is wrapped, nor that it is not."""
+    """A reader learns neither that the node is wrapped nor that it is not."""
     stranger = frame(bytes.fromhex("030400820101") + raw_tuple(4, b"kind=usb\nname=bmp280\n"))
     with pytest.raises(BadDataError) as why:
         read_origin(stranger)

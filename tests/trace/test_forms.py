@@ -511,7 +511,7 @@ def test_blocks_that_are_no_packets_are_passed_over() -> None:
 
 @pytest.mark.parametrize("length", [0, 8, 11, 13, 14, 30])
 def test_a_block_of_an_impossible_length_is_named_with_its_place(length: int) -> None:
-    """At least its own twelve octets, and a multiple of four: else a reader would go astray, or stand still."""
+    """At least its own twelve octets, and a multiple of four; otherwise a reader would lose its place or loop."""
     head = pcapng.head()
     with pytest.raises(BadDataError) as refused:
         list(pcapng.read_pcapng(head + le(6, length) + bytes(60)))

@@ -315,7 +315,7 @@ def test_a_page_takes_1024_octets_and_not_one_more() -> None:
 
 
 def test_what_cannot_be_kept_open_is_refused_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that would hold the secret has no home to stand in: it ends, and nothing is left of it."""
+    """The process that would keep the secret has no home folder: it ends and leaves nothing."""
     begun: list[subprocess.Popen[bytes]] = []
     real = subprocess.Popen
 

@@ -96,7 +96,7 @@ PBES2, PBKDF2 = "06092a864886f70d01050d", "06092a864886f70d01050c"
     ],
 )
 def test_rounds_are_counted_before_a_passphrase_is_tried(tmp_path: Path, parameters: str, counted: bool) -> None:
-    """What is counted and not too much is tried, and is no key then; of anything else nothing is tried."""
+    """A cost within the limits is tried, and yields no key; any other cost is not tried."""
     path = tmp_path / "ca.pem"
     path.write_text(pem_of(bytes.fromhex(f"{PBES2} {PBKDF2} {parameters}")))
     with pytest.raises(VaultError) as refused:

@@ -1,4 +1,4 @@
-"""What an adapter tries again, for how long, and which device it believes; bleak and the air are mocks."""
+"""Retries of a Bluetooth adapter, their limits, and the device it accepts; bleak and the air are mocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a bus that does not open, is not read or takes no frame is called, and what to do; all without a bus.
+"""Errors of a bus that does not open, cannot be read or takes no frame, with their remedies; all without a bus.
 
 The interface is a mock: no test machine has one that fails in each of these ways.
 """

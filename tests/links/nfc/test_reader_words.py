@@ -1,4 +1,4 @@
-"""What a reader that does not open is called, who holds it, and what to do; sysfs and the chip are mocks."""
+"""Error of a reader that does not open: its name, its holder, the remedy; sysfs and the chip are mocks."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ OLD, NEW = bytes(range(40)), b"\x55" * 23
 
 
 class Memory:
-    """A reader with one tag: ``layout`` stands before the message, ``locked`` are octets that belong to its maker."""
+    """Mock reader with one tag: ``layout`` precedes the message, ``locked`` octets are the manufacturer's."""
 
     def __init__(self, layout: bytes, message: bytes, locked: range = range(0)) -> None:
         self.octets = bytearray(b"\xa5" * 4 * PAGES)

@@ -1,4 +1,4 @@
-"""What the reader makes of each record of an MCAP, written here by hand."""
+"""Each record type of MCAP, written by hand, and how the reader interprets it."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ def test_the_instant_of_a_sample_is_its_log_time(tmp_path: Path) -> None:
 
 
 def test_messages_belong_to_the_topic_that_was_described_before_them(tmp_path: Path) -> None:
-    """A part that another program joined numbers its topics anew."""
+    """A part that another program appended renumbers its topics."""
     noted = record(METADATA, text("note") + pairs(note="full"))
     found = entries(
         tmp_path / "run.mcap",

@@ -171,7 +171,7 @@ def test_an_index_of_a_wrong_length_is_no_index(tmp_path: Path, index_of_it: byt
 
 
 def test_topics_of_which_nothing_is_left_have_names_that_say_so(tmp_path: Path) -> None:
-    """The messages count more than their description: they stay, with all that the file itself still says of them."""
+    """Messages outlive their description: they are kept, with the metadata that the file still has."""
     body = channel(2, 9) + message(7, 2) + message(8, 5)
     path = finished(tmp_path / "run.mcap", chunk(KIND + channel(), crc=1), chunk(body, (7, 8)))
     done = recover(path)

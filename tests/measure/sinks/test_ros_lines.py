@@ -447,7 +447,7 @@ def test_a_rospy_child_is_a_node_of_the_given_name_until_its_parent_ends(
 def test_an_rclpy_child_is_a_node_of_the_given_name_until_its_parent_ends(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], alone: bool, domain: str | None, ports: Any
 ) -> None:
-    """What it listens on is kept on this machine before anything is published."""
+    """Its listening sockets are bound to loopback before anything is published."""
     course: list[Any] = []
 
     class Executor:

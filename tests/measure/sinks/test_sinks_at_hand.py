@@ -1,4 +1,4 @@
-"""Sinks without their packages, servers and peers: what they say, answer and hear. Every peer here is a mock."""
+"""Sinks without their packages and servers: what they send, answer and receive. Every peer here is a mock."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class JointState(SimpleNamespace):
 def test_set_points_of_ros_2_go_to_their_channel_or_to_the_joints_that_they_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What DDS cannot read just now is read a little later."""
+    """A sample that DDS cannot read yet is read on the next try."""
     core = pytest.importorskip("cyclonedds.core")
     sink = Ros2Sink("ros2:7")
     sink._types = SimpleNamespace(Float64=Float64, JointState=JointState)

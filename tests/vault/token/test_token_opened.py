@@ -254,7 +254,7 @@ POINT = SoftwareKey(7).point
 
 
 class Objects:
-    """A session on a token that holds what a test says."""
+    """Mock session on a token with the objects of the test."""
 
     def __init__(self, private, public=()):
         self.private, self.public = private, public
