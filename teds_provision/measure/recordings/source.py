@@ -216,7 +216,8 @@ def _fact(name: str, value: Any, where: str) -> Any:
 def channel_number(value: object, where: str) -> int:
     """Return the number of a TransducerChannel; raises BadDataError."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
-        raise BadDataError(f"{where}: {_short(value)} is no number of a channel.")
+        what = "the channel number is missing" if value is None else f"{_short(value)} is not a channel number"
+        raise BadDataError(f"{where}: {what}.")
     return value
 
 

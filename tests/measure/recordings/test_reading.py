@@ -350,8 +350,8 @@ LENGTHS = "the lists in or above the line are not of one length."
         ({"raw": [1, 2]}, LENGTHS),
         ({"value": [1, 2]}, LENGTHS),
         ({"uuid": "x" * 1001}, LENGTHS),
-        ({"channel": -1}, "-1 is no number of a channel."),
-        ({"channel": ...}, "None is no number of a channel."),
+        ({"channel": -1}, "-1 is not a channel number."),
+        ({"channel": ...}, "the channel number is missing."),
     ],
 )
 def test_a_line_of_json_that_is_no_samples_is_named(tmp_path: Path, change: dict[str, Any], why: str) -> None:
