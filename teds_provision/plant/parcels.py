@@ -322,9 +322,10 @@ def refuse_bundle(station: Station, error: incoming.NothingImportedError, parcel
 
 
 def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]]:
-    """Return the waiting parcels of a kind, oldest first, each with its document."""
+    """Return the waiting parcels of a kind, oldest first, each with its document; none that was taken meanwhile."""
     parcels = station.plant.parcels
-    return [(row, parcels.document(row.id, "in")) for row in parcels.all("in", "waiting") if row.kind == kind]
+    found = ((row, parcels.document(row.id, "in")) for row in parcels.all("in", "waiting") if row.kind == kind)
+    return [(row, document) for row, document in found if document]
 
 
 # -- outgoing ----------------------------------------------------------------------------------------------------------

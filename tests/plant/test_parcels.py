@@ -24,7 +24,7 @@ from teds_provision.protocol.plant.roster import Share
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.line import SignRequestRow
-from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
+from teds_provision.station.plant.parcels import ParcelKind, ParcelRow, Parcels
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry, utc_now
 from tests.bench import Board, talk
@@ -672,3 +672,34 @@ def test_what_waits_of_one_sender_keeps_no_other_out(plant: Plant) -> None:
         plant.transport.send(Parcel(sender, west.fingerprint, sealed, until, plant[sender].fingerprint))
         sync(plant, "west")
         assert len(parcels.received(west, "job")) == kept
+
+
+def test_of_two_commands_at_once_the_later_one_neither_refuses_nor_answers_what_the_other_took(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It read a parcel that was gone, refused the empty octets and ended with 8."""
+    plant.roster(ROLES)
+    west, south = plant["west"], plant["south"]
+    for _ in range(2):
+        board = board_of(west, os.urandom(10))
+        with west.lock("test"):
+            order = outgoing.ExportOrder(("south",), (board.uuid,))
+            parcels.send_export(west, outgoing.plan_export(west, order), now())
+    sync(plant, "west", "south")
+    banned, _ = (pending_uuid(south, row.id) for row in south.plant.parcels.all("in", "waiting"))
+    life.revoke(south, banned, "stolen")
+    words, listed = ("import-keys", "--received", "--yes"), Parcels.all
+    begun: list[str] = []
+
+    def all_and_then_another(self: Parcels, *which: Any) -> Any:
+        found = listed(self, *which)
+        if which[0] == "in" and not begun:
+            begun.append("another")
+            assert call(tmp_path / "south", *words).code == 6
+        return found
+
+    monkeypatch.setattr(Parcels, "all", all_and_then_another)
+    later = call(tmp_path / "south", *words)
+    assert (later.code, later.out) == (0, "Nothing waits.\n")
+    events = [json.loads(text)["act"] for _, _, text in south.plant.outbox(100)]
+    assert events.count("refused") == 1

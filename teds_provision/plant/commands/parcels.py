@@ -83,8 +83,10 @@ def extend_import(command: click.Command) -> None:
 
 
 def _refuse(app: App, station: Station, parcel: str, octets: bytes) -> None:
-    """Answer a bundle of which nothing can be imported, unless that has changed meanwhile."""
+    """Answer a bundle of which nothing can be imported, unless that has changed or was done meanwhile."""
     with station.lock("import-keys", app.note):
+        if station.plant.parcels.get(parcel, "in") is None:
+            return
         try:
             plan_import(station, octets)
         except NothingImportedError as error:
@@ -103,6 +105,8 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
         if row.kind != "bundle":
             continue
         octets = parcels.document(row.id, "in")
+        if not octets:
+            continue  # another command or a sync took it meanwhile
         try:
             shown = plan_import(station, octets)
         except TedsProvisionError as error:
