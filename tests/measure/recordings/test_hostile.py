@@ -44,7 +44,7 @@ def refused(path: Path, *words: str) -> None:
         (b'{"event":' + b"[" * 100_000 + b"\n", [":1:", "not JSON"]),
         (b'{"event":"data"' + b" " * (9 << 20), [":1:", "octets"]),
         (b'{"event":"channel","uuid":5}\n', ["uuid"]),
-        (b'{"event":"channel","uuid":"1","number":1e9}\n', ["number of a channel"]),
+        (b'{"event":"channel","uuid":"1","number":1e9}\n', ["channel number"]),
         (b'{"event":"channel","uuid":"1","number":1,"low":NaN}\n', ["not finite"]),
         (b'{"event":"channel","uuid":"1","number":1,"low":1' + 400 * b"0" + b"}\n", ["low of a channel is 1000"]),
         (b'{"event":"channel","uuid":"1","number":1,"calibration":{"method":"x"}}\n', [":1:", "calibration of"]),
