@@ -96,6 +96,9 @@ class MqttSink(ThreadedSink):
         self._parts_of_topics: dict[str, str] = {}
         """The name of each node in topics, as it was announced last."""
         self._owed_entities: dict[tuple[str, int], None] = {}  # entities to announce, in this order
+        self._reports: dict[str, NodeReport] = {}
+        """The newest report of each node; the broker gets it anew after each connection and under each new name."""
+        self._owed_states: dict[str, None] = {}  # nodes whose report the broker does not have, in this order
         self._left: list[str] = []  # topics of former names, whose retained states must be removed
         self._newest: dict[str, dict[str, float | None]] = {}
         self._due: dict[str, float] = {}
@@ -120,6 +123,10 @@ class MqttSink(ThreadedSink):
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect
         self._client = client
+
+    def _state_topic(self, uuid: str) -> str:
+        """Return the topic of a node's state."""
+        return f"{self._topics.station}/{self._topics.node(uuid)}/state"
 
     @property
     def _status(self) -> str:
@@ -206,6 +213,7 @@ class MqttSink(ThreadedSink):
         taken = set(self._parts_of_topics.values()) if renamed else set()
         self._left += [before[uuid] for uuid in renamed if before[uuid] not in taken]
         self._owed_entities |= dict.fromkeys(changed)
+        self._owed_states |= dict.fromkeys(uuid for uuid in self._reports if uuid in renamed)
         if renamed:
             self._owed_entities |= dict.fromkeys(key for key in self._facts if key[0] in renamed)
 
@@ -217,9 +225,9 @@ class MqttSink(ThreadedSink):
             self._learn(item)
             self._announce()
         elif isinstance(item, NodeReport):
-            self._publish(
-                f"{self._topics.station}/{self._topics.node(item.uuid)}/state", status_line(item), retain=True
-            )
+            self._reports[item.uuid] = item
+            self._owed_states[item.uuid] = None
+            self._announce()
 
     def _idle(self, now: float) -> None:
         self._greet()
@@ -232,14 +240,20 @@ class MqttSink(ThreadedSink):
             self._why = ""
             self._set_state("running", f"connected to {self._host}")
             self._owed_entities = dict.fromkeys(self._facts)
+            self._owed_states = dict.fromkeys(self._reports)
             self._announce()
 
     def _announce(self) -> None:
-        """Announce new entities to Home Assistant, as far as the library takes them for now."""
+        """Publish states and announce entities that the broker does not have, as far as the library takes them."""
         if not self._connected.is_set() or self._anew.is_set():
             return
         while self._left:
             self._client.publish(f"{self._topics.station}/{self._left.pop()}/state", b"", retain=True)
+        while self._owed_states:
+            uuid = next(iter(self._owed_states))
+            if not self._publish(self._state_topic(uuid), status_line(self._reports[uuid]), retain=True):
+                return
+            del self._owed_states[uuid]
         while self._owed_entities:
             key = next(iter(self._owed_entities))
             if not self._discover(self._facts[key]):
@@ -251,6 +265,7 @@ class MqttSink(ThreadedSink):
         if facts.unsigned:  # raw values have no quantity, so there is no sensor to show
             return True
         node = f"{self._topics.station}/{self._topics.node(facts.uuid)}"
+        state = self._state_topic(facts.uuid)
         marked = " (unverified)" if facts.unverified else ""
         device = {
             "identifiers": [facts.uuid],
@@ -265,7 +280,7 @@ class MqttSink(ThreadedSink):
             "unique_id": f"{facts.uuid}_{facts.number}",
             "state_topic": node,
             "value_template": f"{{{{ value_json.{self._field(facts)} }}}}",
-            "availability": [{"topic": self._status}, {"topic": f"{node}/state", "value_template": RUNS}],
+            "availability": [{"topic": self._status}, {"topic": state, "value_template": RUNS}],
             "availability_mode": "all",
             "state_class": "measurement",
             "device": device,
@@ -293,8 +308,8 @@ class MqttSink(ThreadedSink):
                 values["unsigned"] = True
             if any(facts.unverified for facts in known):
                 values["unverified"] = True
-            if self._connected.is_set():
-                self._publish(f"{self._topics.station}/{self._topics.node(block.uuid)}", values)
+            topic = f"{self._topics.station}/{self._topics.node(block.uuid)}"
+            if self._connected.is_set() and self._publish(topic, values):
                 self._count(written=len(newest))
             else:
                 self._count(dropped=len(newest))
@@ -307,9 +322,10 @@ class MqttSink(ThreadedSink):
         return value if unit is None else unit.from_si(value)
 
     def _publish(self, topic: str, words: dict[str, Any], *, qos: int = 0, retain: bool = False) -> bool:
-        """Return True if the library took it; without a connection it keeps QoS 1 messages and drops the rest."""
+        """Return True if the library took it; without a connection it keeps QoS 1 messages and refuses the rest."""
         octets = _JSON.encode(words).encode()
-        if self._client.publish(topic, octets, qos=qos, retain=retain).rc == _FULL:
+        code = self._client.publish(topic, octets, qos=qos, retain=retain).rc
+        if code == _FULL or (code != 0 and qos == 0):
             return False
         self._count(octets=len(octets), messages=1)
         return True

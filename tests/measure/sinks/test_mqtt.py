@@ -637,11 +637,60 @@ def test_values_are_marked_if_one_of_their_channels_is_and_each_node_has_its_own
 
 def test_the_state_of_a_node_has_its_counters() -> None:
     sink, client = desk_sink(ANGLE)
+    sink._announce()
+    client.published.clear()
     sink._process_item(NodeReport(ARM, "lost", "no frame", samples=9, lost=1, late=2, bad=3, invalid=4))
     [(topic, octets)] = client.published
     words = json.loads(octets)
     assert (topic, words["state"], words["why"]) == ("bench/arm/state", "lost", "no frame")
     assert [words[name] for name in ("samples", "lost", "late", "bad", "invalid")] == [9, 1, 2, 3, 4]
+
+
+def test_each_connection_publishes_the_newest_state_of_every_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An entity whose node has no retained state stays unavailable, also if the node runs."""
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    state = "bench/arm/state"
+    sink._process_item(NodeReport(ARM, "starting"))
+    sink._process_item(NodeReport(ARM, "running"))
+    assert library.of("publish") == [], "nothing before there is a connection"
+    for _ in range(2):
+        connected(sink)
+        sink._idle(0.0)
+        first, (words, more), config = library.of("publish")
+        assert (first, words[0], more) == (ONLINE, state, {"qos": 0, "retain": True})
+        assert json.loads(words[1])["state"] == "running"
+        assert config[0][0].endswith("/config")
+        sink._idle(0.0)
+        assert library.of("publish") == [], "once"
+    library.rc = 4  # the connection was lost, and nobody has noticed yet
+    sink._process_item(NodeReport(ARM, "lost"))
+    assert [words[0] for words, _ in library.of("publish")] == [state]
+    library.rc = 0
+    sink._idle(0.0)
+    [(words, _)] = library.of("publish")
+    assert (words[0], json.loads(words[1])["state"]) == (state, "lost")
+
+
+def test_a_node_with_a_new_name_keeps_its_state_under_it() -> None:
+    sink, client = desk_sink(ANGLE, FORCE)
+    sink._announce()
+    sink._process_item(NodeReport(ARM, "running"))
+    sink._process_item(NodeReport(HAND, "running"))
+    client.published.clear()
+    sink._process_item((replace(ANGLE, chosen=((0, "left"),)),))
+    assert [topic for topic, _ in client.published] == [
+        "bench/arm/state", "bench/left/state", f"homeassistant/sensor/{ARM}/1/config",
+    ]  # fmt: skip
+    assert json.loads(client.published[1][1])["state"] == "running"
+
+
+def test_values_that_the_library_refuses_are_counted_as_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    connected(sink)
+    sink._idle(0.0)
+    library.rc = 4  # the connection was lost, and nobody has noticed yet
+    sink._process_item(block([[7]], [[1.5]]))
+    assert (sink.stats.written, sink.stats.dropped) == (0, 1)
 
 
 def test_two_nodes_that_swap_their_names_lose_neither_state() -> None:
