@@ -200,7 +200,9 @@ def test_a_statement_is_whole_and_in_the_order_of_the_contract() -> None:
     [
         ("unit", 1, True), ("unit", 0, False), ("unit", None, True), ("attempt", 1, True), ("attempt", 0, False),
         ("attempt", None, False), ("heads", ["0" * 16, 3], True), ("heads", ["0" * 15, 3], False),
-        ("heads", ["0" * 16], False), ("heads", ["G" * 16, 3], False), ("epoch", 4_294_967_295, True),
+        ("heads", ["0" * 16], False), ("heads", ["G" * 16, 3], False), ("heads", ["A" * 16, 3], False),
+        ("heads", ["0" * 16, -1], False), ("heads", ["0" * 16, True], False), ("heads", ["0" * 16, 0], True),
+        ("epoch", 4_294_967_295, True),
         ("epoch", 4_294_967_296, False), ("epoch", -1, False), ("epoch", 1.5, False), ("epoch", True, False),
         ("steps", [["x", "ok", 1]] * 64, True), ("steps", [["x", "ok", 1]] * 65, False),
         ("certificates", [[255, H]], True), ("certificates", [[256, H]], False),

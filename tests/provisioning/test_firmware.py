@@ -423,6 +423,7 @@ def test_a_measurement_warns_or_refuses(station: Station, tmp_path: Path, report
         ("other", "other"),
         ("outdated", "outdated"),
         ("on-trial", "on-trial"),
+        ("pending", "pending"),
         ("good", ""),
         ("unjudged", ""),
     ],

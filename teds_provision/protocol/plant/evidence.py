@@ -522,7 +522,9 @@ def _step(value: object) -> tuple[str, str, int]:
 
 def _heads(heads: object) -> tuple[str, int]:
     match heads:
-        case [str(digits), int(count)] if re.fullmatch(r"[0-9a-f]{16}", digits):
+        case [str(digits), int(count)] if re.fullmatch(r"[0-9a-f]{16}", digits) and not isinstance(count, bool):
+            if count < 0:
+                raise BadDataError("The number of chains of the facts is negative.")
             return digits, count
     raise BadDataError("The heads of the facts are not [16 digits, number of chains].")
 

@@ -48,6 +48,8 @@ def test_the_records_of_a_sold_tag() -> None:
         ([("WLCCTL", "0A0C004B0003")], "no", 75, None),
         ([("WLCCTL", "8A0000FF0001")], "error", None, None),
         ([("WLCSTAI", "01FF")], "no", None, None),  # 255 %
+        ([("WLCCAP", "2081091E030A"), ("WLCCTL", "8A0000FF0001")], "error", None, None),
+        ([("WLCCAP", "2001091E030A"), ("WLCCTL", "0A0C004B0003")], "no", 75, None),
     ],
 )
 def test_states(records: list[tuple[str, str]], state: str, percent: int | None, celsius: int | None) -> None:
