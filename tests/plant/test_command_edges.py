@@ -6,6 +6,7 @@ import json
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -241,6 +242,43 @@ def test_a_database_is_joined_if_it_is_of_the_rosters_registry(
 def test_a_root_certificate_is_found_from_any_folder(url: str, query: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "absolute", lambda path: path if path.is_absolute() else Path("/home/me") / path)
     assert plant.connecting.absolute(url) == f"postgresql://h/d{query}"
+
+
+def test_a_history_is_accepted_while_no_sync_runs(home: Path, roster: Roster, monkeypatch: pytest.MonkeyPatch) -> None:
+    done, west, branch = list[str](), roster.named("west"), (7, "ab" * 32)
+    assert west is not None
+
+    @contextmanager
+    def sync_lock(_station: Station) -> Iterator[None]:
+        done.append("lock")
+        yield
+        done.append("unlock")
+
+    def step(name: str) -> Callable[..., tuple[int, str]]:
+        def run(_station: Station, *given: object) -> tuple[int, str]:
+            assert given in ((), (west.fingerprint, "ab" * 4, None)), "this member, by the hash that was given"
+            done.append(name)
+            return branch
+
+        return run
+
+    monkeypatch.setattr(plant.sync, "sync_lock", sync_lock)
+    monkeypatch.setattr(plant.connecting, "open_transport", lambda _: None)
+    for module, name in (
+        (plant.membership, "branch"),
+        (plant.membership, "accept"),
+        (plant.apply_pages, "apply_claims"),
+    ):
+        monkeypatch.setattr(module, name, step(name))
+    words = ("registry", "accept", "west", "--page", "ab" * 4)
+    shown = {"n": 7, "hash": "ab" * 32}
+    assert call(home, *words, "--dry-run").out == f"Plan: page 7 ({'ab' * 8}) would be accepted here.\n"
+    assert call(home, "--json", *words, "--dry-run").json == {"done": 0, **shown, "plan": True}
+    assert call(home, *words).code == 6, "nobody is there to confirm"
+    assert done == ["branch"] * 2
+    assert call(home, *words, "--yes").out == f"Page 7 ({'ab' * 8}) and its successors count here.\n"
+    assert done[2:] == ["lock", "accept", "apply_claims", "unlock"]
+    assert call(home, "--json", *words, "--yes").json == {"done": 1, **shown}
 
 
 # -- keys as parcels ---------------------------------------------------------------------------------------------------

@@ -242,8 +242,9 @@ def test_a_rebuilt_home_gives_no_new_unit_before_it_knows_which_it_gave(owner: S
     owner.plant.begin_restored()
     fresh = LineRun(owner, run.job)
     assert allotted(fresh).attempt == 2, "of a board whose unit is known"
-    with pytest.raises(PolicyError, match="restored from a backup"):
+    with pytest.raises(PolicyError, match="restored from a backup") as error:
         fresh.allot_unit(cast("Conversation", SimpleNamespace(tapped=True)), board(B), PREPARED, None)
+    assert error.value.hint == "To get them: teds-provision registry sync"
     owner.plant.end_restored()
     assert allotted(LineRun(owner, run.job), B).row.unit == 2  # type: ignore[union-attr]
 
@@ -394,6 +395,7 @@ def test_a_calibration_is_the_very_file_that_the_job_names(tmp_path: Path, owner
     (folder / "b.csv").write_bytes(TABLE)
     run = LineRun(owner, one, calibrations=folder)
     assert run.order(board()).order.calibration == folder / "b.csv"
+    assert run.order(board()).order.drop_calibration is False
     assert run.calibration_digest(A) == digest
     LineRun(owner, one, calibrations=folder / "b.csv").order(board())
     with pytest.raises(NotFoundError):
@@ -415,6 +417,7 @@ def test_a_calibration_is_the_very_file_that_the_job_names(tmp_path: Path, owner
     with pytest.raises(NotFoundError, match="requires a calibration for each board"):
         LineRun(owner, listed).order(board())
     none = LineRun(owner, job(owner), calibrations=folder)
+    assert none.order(board()).order.drop_calibration is True, "a board that has one loses it"
     assert (none.order(board()).order.calibration, none.calibration_digest(A)) == (None, None)
 
 

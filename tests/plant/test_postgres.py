@@ -98,7 +98,9 @@ def test_a_parcel_goes_to_its_receiver_and_is_taken_away(transport: Registry, lo
     assert (waiting.id, waiting.sender, waiting.to, waiting.octets) == (name, login.fingerprint, to.fingerprint, 6)
     assert [waiting_parcel.id for waiting_parcel in transport.look().parcels] == [name]
     assert receiver.parcel(name) == b"sealed"
-    receiver.remove([name])
+    second = str(uuid.uuid4())
+    transport.send(second, to.fingerprint, b"sealed", later())
+    receiver.remove([name, second])
     assert transport.look().parcels == ()
     assert receiver.parcel(name) is None
     with pytest.raises(PolicyError):

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import StoreError
 from teds_provision.handover.incoming import ImportPlan
 from teds_provision.handover.pending import BundleNotes
 from teds_provision.plant.parcels import (
@@ -22,6 +23,7 @@ from teds_provision.plant.parcels import (
     _note_refused,
     _put_out,
     _Reader,
+    import_parcel,
     waiting_out,
 )
 from teds_provision.plant.transport import Parcel
@@ -199,6 +201,7 @@ def test_of_what_expired_without_a_receipt_an_open_move_goes_again_and_a_copy_is
         ("copy", "copy", "open", "2026-03-01T12:00:00Z"),
         ("closed copy", "copy", "closed", "2026-03-01T12:00:00Z"),
         ("twice", "copy", "open", "2026-03-01T12:00:00Z"),
+        ("thrice", "copy", "open", "2026-03-01T12:00:00Z"),
     ]
     with station.transaction():
         for name, mode, state, expires in cases:
@@ -208,12 +211,13 @@ def test_of_what_expired_without_a_receipt_an_open_move_goes_again_and_a_copy_is
             parcels.put_shared([(A, len(name))], SOUTH, name, "sent")
         again_at = "2026-03-08T12:00:00Z"
         parcels.put(ParcelRow("2", "out", SOUTH, "bundle", "ready", again_at, "twice", "", "2026-03-01T12:00:00Z"), b"")
+        parcels.put(ParcelRow("3", "out", SOUTH, "bundle", "sent", again_at, "thrice", "", "2026-03-01T12:00:00Z"), b"")
     _expire(station, NOW)
     assert again == [(SOUTH, (A,), "move")]
-    assert [row.id for row in parcels.all("out", "ready", "sent")] == ["young move", "2"]
+    assert [row.id for row in parcels.all("out", "ready", "sent")] == ["young move", "2", "3"]
     assert {row.id: row.state for row in station.handovers.all()} == {
         "open move": "open", "young move": "open", "closed move": "closed", "undone move": "undone", "copy": "dropped",
-        "closed copy": "closed", "twice": "open",
+        "closed copy": "closed", "twice": "open", "thrice": "open",
     }, "handover list shows as open what may still be receipted"  # fmt: skip
     assert [name for name, *_ in cases if parcels.shared_in(name)] == ["young move"], "to be shared once more"
 
@@ -241,6 +245,34 @@ def test_a_receiver_refuses_on_its_own_page_what_came_from_here(station: Station
     assert [parcels.shared_in(bundle)[0][2] for bundle in bundles] == ["refused", "sent", "sent", "sent"]
     states = {row.id: row.state for row in station.handovers.all()}
     assert [states[bundle] for bundle in bundles] == ["dropped", "open", "open", "open"]
+
+
+def test_a_bundle_that_was_imported_leaves_with_its_receipt_for_its_sender_or_stays(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parcels = station.plant.parcels
+    row = ParcelRow("came", "in", WEST, "bundle", "waiting", "2099-01-01T00:00:00Z")
+    parcels.put(row, b"bundle")
+    done = SimpleNamespace(row=SimpleNamespace(id="a bundle", peers=(WEST,)), receipt=b"\nreceipt\n")
+    plan = cast("Any", SimpleNamespace())
+    imported = list[object]()
+    monkeypatch.setattr(
+        "teds_provision.plant.parcels.incoming.import_bundle", lambda *given: imported.append(given) or done
+    )
+
+    def full(*_: object, **__: object) -> str:
+        raise StoreError("The disk is full.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("teds_provision.plant.parcels._put_out", full)
+        with pytest.raises(StoreError, match="The disk is full"):
+            import_parcel(station, row, plan)
+    assert parcels.get("came", "in") is not None, "all in one transaction"
+    assert import_parcel(station, row, plan) is cast("Any", done)
+    assert imported == [(station, plan)] * 2
+    assert parcels.get("came", "in") is None
+    [out] = parcels.all("out", "ready")
+    assert (out.kind, out.peer, out.about, parcels.document(out.id, "out")) == ("receipt", WEST, "a bundle", b"receipt")
 
 
 def test_a_receipt_waits_seven_days_and_a_bundle_until_it_expires(station: Station) -> None:

@@ -14,8 +14,9 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.cli.rendering import local_time
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.plant import schema
+from teds_provision.plant.commands import nodes as of_nodes
 from teds_provision.plant.commands import parcels as of_parcels
 from teds_provision.plant.commands import registry as commands
 from teds_provision.plant.removed_members import RemovalReview
@@ -434,20 +435,50 @@ def test_a_node_as_the_plant_reports_it(home: Path, monkeypatch: pytest.MonkeyPa
     assert call(home, "--json", "nodes", "--plant").json == {"nodes": found}
 
 
+def test_a_node_of_this_station_has_all_its_conflicts_and_the_name_that_the_plant_gives_it(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two, three = ("8d" * 10, "8e" * 10, "8f" * 10)
+    found = [(bytes.fromhex(one), "two keys", "a and b"), (bytes.fromhex(two), "name", "c"),
+             (bytes.fromhex(one), "other pin", "d")]  # fmt: skip
+    asked = list[list[str]]()
+
+    def names(_station: Station, _roster: object, uuids: list[bytes]) -> dict[bytes, str]:
+        asked.append([uuid.hex() for uuid in uuids])
+        return {bytes.fromhex(two): "left", bytes.fromhex(one): "not this one"}
+
+    monkeypatch.setattr(plant.status, "names", names)
+    monkeypatch.setattr(station.plant.claims, "conflicts", lambda: iter(found))
+    monkeypatch.setattr(of_nodes, "CHUNK", 2)
+    rows = [{"uuid": one, "name": "mine", "state": "keyed"}, {"uuid": two, "name": None}, {"uuid": three, "name": ""}]
+    assert list(of_nodes.VIEW.described(station, iter(rows))) == [
+        {"uuid": one, "name": "mine", "state": "keyed", "conflicts": [
+            {"name": "two keys", "why": "a and b"}, {"name": "other pin", "why": "d"}]},
+        {"uuid": two, "name": "left", "conflicts": [{"name": "name", "why": "c"}]},
+        {"uuid": three, "name": None, "conflicts": []},
+    ]  # fmt: skip
+    assert asked == [[two], [three]]
+    monkeypatch.setattr(type(station.plant), "roster", None)
+    assert list(of_nodes.VIEW.described(station, iter(rows))) == rows
+
+
 def test_each_parcel_that_waits_is_shown_with_its_reason_and_taken_in(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [("bad", "bundle", "waiting", "a move"), ("job", "job", "waiting", ""), ("late", "bundle", "later", "pages"),
-            ("new", "bundle", "later", ""), ("sent", "bundle", "sent", "")]  # fmt: skip
+            ("new", "bundle", "later", ""), ("sent", "bundle", "sent", ""), ("worse", "bundle", "waiting", ""),
+            ("taken meanwhile", "bundle", "waiting", "")]  # fmt: skip
     with Station.inspect(home) as station:
         for name, kind, state, why in rows:
             way: Any = "out" if state == "sent" else "in"
             row = ParcelRow(name, way, WEST, cast("Any", kind), cast("Any", state), "2099-01-01T00:00:00Z", "", why)
-            station.plant.parcels.put(row, name.encode())
+            station.plant.parcels.put(row, name.encode() if name != "taken meanwhile" else b"")
 
     def plan_import(_station: Station, octets: bytes) -> Any:
         if octets == b"bad":
             raise BadDataError("It is none.")
+        if octets == b"worse":
+            raise PolicyError("Nobody trusts it.")
         return octets
 
     taken: list[str] = []
@@ -458,15 +489,19 @@ def test_each_parcel_that_waits_is_shown_with_its_reason_and_taken_in(
     done = SimpleNamespace(fresh=True)
     monkeypatch.setattr(plant.parcels, "import_parcel", lambda _station, row, _plan: taken.append(row.id) or done)
     shown = ["Warning: Parcel bad is refused: It is none.", "Plan of late.", "Reason for waiting: pages",
-             "Plan of new.", "Reason for waiting: it has just arrived"]  # fmt: skip
+             "Plan of new.", "Reason for waiting: it has just arrived",
+             "Warning: Parcel worse is refused: Nobody trusts it."]  # fmt: skip
     plan = call(home, "import-keys", "--received", "--dry-run")
-    assert (plan.err.splitlines(), plan.out) == ([*shown, "Error: It is none."], "2 parcels. 1 parcel refused.\n")
+    assert (plan.err.splitlines(), plan.out) == ([*shown, "Error: It is none."], "2 parcels. 2 parcels refused.\n")
     assert (plan.code, taken) == (8, [])
     assert call(home, "import-keys", "--received").code == 6
     assert taken == []
     imported = call(home, "--json", "import-keys", "--received", "--yes")
     assert (imported.code, taken) == (8, ["late", "new"]), "the one that is refused keeps no other out"
-    assert imported.json["refused"] == [{"parcel": "bad", "why": "It is none."}]
+    assert imported.json["refused"] == [
+        {"parcel": "bad", "why": "It is none."}, {"parcel": "worse", "why": "Nobody trusts it."}
+    ]  # fmt: skip
+    assert imported.json["plan"] is False
     assert [(one["parcel"], one["why"], one["fresh"]) for one in imported.json["received"]] == [
         ("late", "pages", True), ("new", "", True)
     ]  # fmt: skip

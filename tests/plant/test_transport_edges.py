@@ -936,6 +936,36 @@ def test_a_station_without_a_roster_takes_and_sends_nothing(station: Station, mo
     assert list(yield_stats._of_pages(station, "job")) == []
 
 
+@pytest.mark.parametrize("behind", [timedelta(days=-1), timedelta(days=1)])
+def test_parcels_come_before_they_go_at_a_time_that_is_not_before_the_roster(
+    station: Station, monkeypatch: pytest.MonkeyPatch, behind: timedelta
+) -> None:
+    """By a clock that was set back, a copy that is over would count again."""
+    held = station.plant.roster
+    assert held is not None
+    clock, asked = held.created - behind, list[tuple[str, object]]()
+    at = max(clock, held.created)
+
+    def take_in(_station: Any, _transport: Any, seen: Any, when: object) -> Any:
+        asked.append(("in", when))
+        assert seen([NODE]) == ("views of", [NODE])
+        return parcels.ParcelCounts(2, 3)
+
+    def send_out(_station: Any, _transport: Any, seen: Any, when: object) -> Any:
+        asked.append(("out", when))
+        return parcels.SentParcels(4, ("held back",))
+
+    monkeypatch.setattr(sync, "now", lambda: clock)
+    monkeypatch.setattr(sync, "merged_views", lambda _station, roster, uuids: roster is held and ("views of", uuids))
+    monkeypatch.setattr(sync.removed_members, "review", lambda _station, _roster, when: asked.append(("review", when)))
+    monkeypatch.setattr(sync.parcels, "take_in", take_in)
+    monkeypatch.setattr(sync.parcels, "send_out", send_out)
+    done = sync.SyncResult(remarks=["before"])
+    sync._parcels(station, cast("Any", None), held, done)
+    assert asked == [("review", at), ("in", at), ("out", at)], "what came in goes on, and no key of who was removed"
+    assert (done.parcels_in, done.waiting, done.parcels_out, done.remarks) == (2, 3, 4, ["before", "held back"])
+
+
 def test_a_parcel_that_waited_for_pages_is_judged_once_more(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
     station.unlock()
     refused, imported = list[object](), list[str]()

@@ -48,8 +48,9 @@ def test_following_the_log_gives_only_what_is_new(logged: Store) -> None:
 def test_an_entry_is_no_change_for_which_nodes_are_judged_anew(store: Store) -> None:
     """Each of 200 nodes that join has an entry, and had the others' standing judged again with it."""
     before = store.changes()
-    store.audit.append("measure", NODE, "joined")
-    assert store.changes() == before
+    for _ in range(3):
+        store.audit.append("measure", NODE, "joined")
+        assert store.changes() == before
     with store.transaction():
         store.audit.append("measure", NODE, "joined")
         store.execute("INSERT INTO meta VALUES('decided', 'today')")

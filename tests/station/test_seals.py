@@ -319,8 +319,27 @@ def test_a_ca_key_that_is_not_the_owners_certifies_nobody(home: Path, opened: Op
     station.identity.put_certificate(fingerprint(station.ca), fingerprint(POINT), b"kept before".ljust(64))
     station.identity.keep_certificate(station.ca, POINT, signature)
     assert station.identity.certificate(station.ca, POINT) == b"kept before".ljust(64), "the first one stays"
-    with pytest.raises(NotAuthenticError, match="did not sign the station"):
+    with pytest.raises(NotAuthenticError) as error:
         station.identity.keep_certificate(OTHER, POINT, signature)
+    assert error.value.message == (
+        f"The CA {fingerprint(OTHER)[:16]} did not sign the station {fingerprint(POINT)[:16]}."
+    )
+    assert station.identity.certificate(OTHER, POINT) is None
+
+
+def test_facts_of_a_step_that_was_taken_back_are_not_remembered(home: Path, opened: Open) -> None:
+    station = opened()
+
+    def fail() -> None:
+        with station.transaction():
+            station.identity.begin_rewrapping(2)
+            assert (station.identity.master, station.identity.rewrapping) == (2, 2)
+            raise KeyError
+
+    assert (station.identity.master, station.identity.rewrapping) == (1, None)
+    with pytest.raises(KeyError):
+        fail()
+    assert (station.identity.master, station.identity.rewrapping) == (1, None)
 
 
 def test_a_hint_about_firmware_needs_no_seal_and_becomes_no_report_of_a_session(home: Path, opened: Open) -> None:

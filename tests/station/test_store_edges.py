@@ -199,6 +199,35 @@ def test_a_copy_is_made_where_there_is_room(store: Store, tmp_path: Path, monkey
     assert list(database._places()) == ["/dev/shm"]
 
 
+def test_what_cannot_be_read_of_a_store_or_its_copy_is_closed_again(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed, refused_at = list[str](), [""]
+
+    def execute(statement: str) -> Any:
+        if statement.startswith(refused_at[0]):
+            raise (sqlite3.DatabaseError("malformed") if refused_at[0] != "SELECT" else KeyboardInterrupt())
+        return SimpleNamespace(fetchone=lambda: None)
+
+    made = SimpleNamespace(execute=execute, close=lambda: closed.append(refused_at[0]))
+    monkeypatch.setattr(database, "sqlite3", SimpleNamespace(Error=sqlite3.Error, connect=lambda *_, **__: made))
+    for error, statement in ((sqlite3.DatabaseError, "PRAGMA journal"), (KeyboardInterrupt, "SELECT")):
+        refused_at[0] = statement
+        with pytest.raises(error):
+            database._copied(store.path, tmp_path)
+    assert closed == ["PRAGMA journal", "SELECT"]
+    assert (tmp_path / "store.sqlite3").read_bytes() == store.path.read_bytes()
+
+    def no_connection(*_: Any, **__: Any) -> Any:
+        raise sqlite3.OperationalError("unable to open database file")
+
+    monkeypatch.setattr(database, "sqlite3", SimpleNamespace(Error=sqlite3.Error, connect=no_connection))
+    with pytest.raises(StoreError) as failure:
+        Database._opened(store.path, create=False)
+    assert failure.value.hint == "Run teds-provision doctor."
+    assert isinstance(failure.value.__cause__, sqlite3.OperationalError)
+
+
 def test_a_home_that_cannot_be_opened_is_a_store_failure_with_its_cure(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
