@@ -467,6 +467,10 @@ def test_a_scan_is_of_the_last_label_with_its_key() -> None:
     scans.require(board(A))
     scans.add_label(B.hex().upper())
     scans.require(board(B, "cd" * 32))
+    for malformed in (B.hex() + "00", B.hex()[:-1], "g" * 20):
+        scans.add_label(malformed)
+        assert notices[-1] == f"This is not a board label: {malformed}"
+    scans.require(board(B))
 
 
 def test_a_unit_belongs_to_its_job(owner: Station) -> None:

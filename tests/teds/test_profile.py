@@ -631,6 +631,19 @@ def test_a_file_in_the_working_folder_never_stands_in_for_a_shipped_type(
     assert passed_over("profiles/load-cell.toml", folders) == ()
 
 
+def test_a_folder_is_no_profile_and_a_text_with_a_slash_is_a_path(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    (first / "arm.toml").mkdir(parents=True)
+    second.mkdir()
+    write(second, "arm", GOOD)
+    assert find_profile("arm", [first, second]) == second / "arm.toml"
+    assert passed_over("arm", [second, first]) == ()
+    plain = write(second, "arm", GOOD).rename(second / "plain")
+    assert find_profile(str(plain), [first]) == plain
+    with pytest.raises(NotFoundError, match="There is no profile file"):
+        find_profile(f"{second}/absent", [first])
+
+
 RICH = """\
 title = "Rich"
 name = "rich board"

@@ -295,6 +295,8 @@ def test_intel_hex_whole_across_64_kib() -> None:
     assert write_intel_hex(BLOCKS[:1], address=0xFFF8) == INTEL_HEX
     text = write_intel_hex([BLOCKS[0], BLOCKS[0]])
     assert text.splitlines()[3][:9] == ":10003000", "each TEDS begins at a multiple of 16"
+    full = TedsBlock(0, 12, bytes(32))
+    assert [address for address, _ in stretches(write_intel_hex([full, full]))] == [0, 48], "at least one octet apart"
     with pytest.raises(BadDataError, match="ends at address FFFFFFFF"):
         write_intel_hex(BLOCKS[:1], address=(1 << 32) - len(META) + 1)
     write_intel_hex(BLOCKS[:1], address=(1 << 32) - len(META))
