@@ -33,6 +33,7 @@ from .owner import ALL, REGISTRY, alone, join, member, roster_of
 
 NODE = "8d4d9da65281f7000001"
 WEST = SoftwareKey(91)
+WEST_DIGITS = fingerprint(WEST.point)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +171,18 @@ def test_a_request_of_a_station_that_is_not_in_the_roster_gets_its_login_and_a_w
     request = tmp_path / "a request"
     request.write_bytes(b"{}")
     asked = SimpleNamespace(name="south", fingerprint="cd" * 32, login=("verifier", "key"))
+    left = SimpleNamespace(name="south", why="stolen")
     monkeypatch.setattr(commands.document, "open_request", lambda _: asked)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            plant.apply_pages, "require_roster",
+            lambda _: SimpleNamespace(name="plant", removed_one=lambda digits: left if digits == "cd" * 32 else None),
+        )  # fmt: skip
+        refused(
+            call(home, "registry", "sql", "--member", request), 6,
+            "south was removed from plant (stolen); its login stays closed.",
+            "A removed key cannot return: create a new station (init), and add that one.",
+        )  # fmt: skip
     monkeypatch.setattr(plant.schema, "member_sql", lambda digits, login: f"-- {digits[:4]} {login[0]}\n")
     done = call(home, "registry", "sql", "--member", request)
     assert (done.code, done.out) == (0, "-- cdcd verifier\n")
@@ -242,6 +254,39 @@ def test_a_database_is_joined_if_it_is_of_the_rosters_registry(
 def test_a_root_certificate_is_found_from_any_folder(url: str, query: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "absolute", lambda path: path if path.is_absolute() else Path("/home/me") / path)
     assert plant.connecting.absolute(url) == f"postgresql://h/d{query}"
+
+
+def test_pages_to_choose_the_last_one_from_are_shown_unless_it_is_given_or_retired(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = [(12, "ab" * 32, "2026-03-01T12:00:00Z"), (9, "cd" * 32, "2026-03-01T11:00:00Z")]
+    monkeypatch.setattr(plant.status, "page_list", lambda _station, digits: pages if digits == WEST_DIGITS else [])
+    listed = (
+        f"The newest pages of west:\n      12  {local_time('2026-03-01T12:00:00Z')}  {'ab' * 8}\n"
+        f"       9  {local_time('2026-03-01T11:00:00Z')}  {'cd' * 8}\n"
+    )
+    for why in ("--lost", "--stolen"):
+        asked = call(home, "registry", "remove", "west", why, "--dry-run")
+        assert (asked.code, asked.err.startswith(listed)) == (2, True)
+    for words in (("--lost", "--last", "0"), ("--retired",)):
+        assert "newest pages" not in call(home, "registry", "remove", "west", *words, "--dry-run").err
+    pages.clear()
+    assert "The newest pages of west:\n  none\n" in call(home, "registry", "remove", "west", "--lost").err
+
+
+def test_who_resumes_is_warned_of_a_copy_and_asked(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    resumed = list[bool]()
+    monkeypatch.setattr(plant.sync, "resume", lambda *_: resumed.append(True) or 2)
+    monkeypatch.setattr(plant.sync, "unknown_pages", lambda *_: ["page"])
+    words = ("registry", "resume", "--files", tmp_path)
+    assert call(home, *words, "--dry-run").out == "Plan: 1 page would be adopted.\n"
+    assert call(home, "--json", *words, "--dry-run").json == {"done": 0, "adopts": 1, "plan": True}
+    warning = "If a copy of this home is in use elsewhere, stop it first. If in doubt, have this station removed.\n"
+    asked = call(home, *words)
+    assert (asked.code, asked.err.startswith(warning), resumed) == (6, True, [])
+    done = call(home, *words, "--yes")
+    assert (done.out, done.err) == ("Adopted: 2 pages. Next: teds-provision registry sync\n", warning)
+    assert call(home, "--json", *words, "--yes").json == {"done": 2}
 
 
 def test_a_history_is_accepted_while_no_sync_runs(home: Path, roster: Roster, monkeypatch: pytest.MonkeyPatch) -> None:

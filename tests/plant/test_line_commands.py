@@ -209,7 +209,10 @@ def test_only_a_keeper_makes_a_job(desk: Desk, owner: Station, prepared: Path) -
         assert roster is not None
         join(station, roster_of(station, member(station, "owner", *ALL[1:]), version=2, previous=roster.hash))
     more = ("--title", "x", "--profile", ANGLE, "--station", "owner", "--count", 1)
-    assert "not a keeper" in owner.refuses("job", "new", *more, *ENDS, code=6)["message"]
+    refused = owner.refuses("job", "new", *more, *ENDS, code=6)
+    assert (refused["message"], refused["hint"]) == (
+        "This station is not a keeper, so no station would accept its job.", "Ask a keeper."
+    )  # fmt: skip
 
 
 def _opened(owner: Station) -> InMemory:

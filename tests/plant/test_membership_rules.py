@@ -225,8 +225,9 @@ def test_a_person_names_the_branch_by_its_hash_and_may_change_his_mind(
             "registry", "accepted", {"station": west, "n": 2, "hash": hash}
         )  # fmt: skip
     for digits in (hashes["a3"], "0" * 8):
-        with pytest.raises(PolicyError, match="Page 2 of west exists here twice"):
+        with pytest.raises(PolicyError, match="Page 2 of west exists here twice") as error:
             branch(station, west, digits, None)
+        assert error.value.hint == "Choose one: --page HASH"
 
 
 def test_without_a_hash_the_branch_that_a_registry_shows_is_taken_and_a_folder_shows_none(

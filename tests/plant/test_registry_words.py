@@ -394,7 +394,10 @@ def test_a_station_belongs_to_one_registry_and_is_asked_once(
     other = replace(held, registry="11111111-2222-4333-8444-555555555555")
     monkeypatch.setattr(plant.membership, "found_roster", lambda *_: other)
     refused = call(home, "registry", "connect", "--files", tmp_path, "--yes")
-    assert (refused.code, f"already belongs to registry {REGISTRY}." in refused.err) == (6, True)
+    assert (refused.code, refused.err) == (
+        6,
+        f"Error: This station already belongs to registry {REGISTRY}.\n  → Leave it first: registry disconnect\n",
+    )
     assert call(home, "registry", "disconnect", "--yes").code == 0
     assert call(home, "registry", "connect", "--files", tmp_path).code == 6, "nobody answers the question"
     assert past == [1]
