@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +19,9 @@ from teds_provision.node.node_template import create
 from teds_provision.node.sources.base import Reading
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
+from teds_provision.protocol.operation.hardware import RawReading
 from teds_provision.protocol.tim import Tim
+from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import list_profiles, load_profile
 from teds_provision.teds.sheet import Sheet
@@ -293,12 +296,83 @@ def altered(number: int, **changes: Any) -> Sheet:
     return replace(made, channels=channels)
 
 
+class Missing(Given):
+    """A source that has a reading of each channel, and no value in it."""
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        return Reading(missing=True)
+
+
+def falling(raw: Mapping[float, Any], *, integer: bool = True) -> Any:
+    """Return a converter from the limits 0 and 0.11 to these raw numbers."""
+
+    def convert(value: float) -> float:
+        found = raw[value]
+        if isinstance(found, Exception):
+            raise found
+        return float(found)
+
+    return SimpleNamespace(low=0.0, high=0.11, raw=convert, form=SimpleNamespace(integer=integer))
+
+
 def test_an_actuator_without_a_name_is_shown_and_not_told_to_the_source() -> None:
     source, shown = Given(), list[ActuatorReading]()
     board = Board(altered(1, name=""), source=source, shown=shown.append)
     board.apply({1: b"\x01\x00"})
     assert (shown[0].name, shown[0].raw) == ("", 256.0)
     assert source.log == []
+
+
+def test_a_value_that_cannot_be_converted_is_no_valid_sample() -> None:
+    board = Board(altered(2, sample=SampleForm(0, 2, 16)), source=Missing())
+    assert board.read(2, 0) == RawReading(b"\0\0", valid=False), "each of the 16 bits is a value"
+    assert board.read(3, 0) == RawReading(b"\xff\xff"), "12 bits have room for one that is none"
+
+
+@pytest.mark.parametrize(
+    ("changes", "safe", "accepted", "refused"),
+    [
+        ({"low": -math.inf}, b"\0\0", [b"\x00\x00", b"\x0f\xff"], [b"\x10\x00"]),
+        ({"high": math.inf}, b"\0\0", [b"\x00\x00", b"\x0f\xff"], [b"\x10\x00"]),
+        ({"sample": SampleForm(1, 4)}, bytes(4), [b"\x3d\xe1\x47\xae"], [b"\x3d\xe1\x48\xff", b"\xb4\x00\x00\x00"]),
+        ({"sample": SampleForm(1, 4), "low": -2.0, "high": -1.0}, b"\xc0\0\0\0", [b"\xbf\x80\0\0"], [bytes(4)]),
+        ({"sample": SampleForm(1, 4), "low": -math.inf}, bytes(4), [b"\xff\x7f\xff\xff"], []),
+        ({"sample": SampleForm(1, 4), "high": math.inf}, bytes(4), [b"\x7f\x7f\xff\xff"], []),
+        ({"sample": SampleForm(4, 1, 3)}, b"\0", [b"\7"], []),
+        ({"sample": SampleForm(0, 2, 12), "low": 0.05, "high": 0.11}, b"\0\0", [b"\0\0", b"\x0f\xff"], [b"\x10\0"]),
+    ],
+)  # fmt: skip
+def test_an_actuator_without_limits_is_safe_at_0_and_accepts_every_raw_number(
+    changes: dict[str, Any], safe: bytes, accepted: list[bytes], refused: list[bytes]
+) -> None:
+    board = Board(altered(1, **changes))
+    assert board.set_point(1) == safe
+    assert [board.accepts(1, octets) for octets in accepted + refused] == [True] * len(accepted) + [False] * len(
+        refused
+    )
+
+
+def test_limits_of_a_falling_curve_are_the_same_raw_numbers_in_their_order() -> None:
+    board = Board(sheet("gripper"))
+    for raw, bounds in (
+        ({0.0: 4095.0, 0.11: 0.0}, (-0.5, 4095.5)),
+        ({0.0: 10.0, 0.11: math.inf}, (-math.inf, math.inf)),
+        ({0.0: OverflowError(), 0.11: 5.0}, (-math.inf, math.inf)),
+    ):
+        board.converters[1] = falling(raw)
+        assert board._raw_limits(1) == bounds
+    board.converters[1] = falling({0.0: -3e6, 0.11: 1e6}, integer=False)
+    assert board._raw_limits(1) == (-3e6 - 3, 1e6 + 3), "a millionth of the larger one"
+
+
+def test_a_battery_begins_within_0_to_100_per_cent() -> None:
+    now = [0.0]
+    for level, in_field, minutes, left in ((-50.0, True, 5, 10), (150.0, False, 600, 40)):
+        now[0] = 0.0
+        battery = Battery(level, host=lambda: now[0])
+        battery.field(present=in_field)
+        now[0] += 60 * minutes
+        assert battery.power().level == left
 
 
 def test_a_channel_without_a_form_of_sample_is_no_hardware() -> None:

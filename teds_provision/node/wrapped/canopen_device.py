@@ -133,6 +133,8 @@ def _sent_objects(objects: ObjectDictionary) -> dict[tuple[int, int], float]:
     """Return the objects that are in a transmit PDO by default, with its event timer in seconds; 0 if none is set."""
     sent: dict[tuple[int, int], float] = {}
     for number in range(_MOST_PDOS):
+        if _MAPPING + number not in objects:
+            continue  # most numbers: each look at one of their 64 places would take as long as at one that exists
         timer = _default(objects, _COMMUNICATION + number, _EVENT_TIMER)
         for place in range(1, _MOST_MAPPED + 1):
             mapped = _default(objects, _MAPPING + number, place)
