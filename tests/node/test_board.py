@@ -370,7 +370,8 @@ def test_a_battery_begins_within_0_to_100_per_cent() -> None:
     for level, in_field, minutes, left in ((-50.0, True, 5, 10), (150.0, False, 600, 40)):
         now[0] = 0.0
         battery = Battery(level, host=lambda: now[0])
-        battery.field(present=in_field)
+        if in_field:
+            battery.field(present=True)
         now[0] += 60 * minutes
         assert battery.power().level == left
 

@@ -243,9 +243,12 @@ def test_stopping_ends_the_sessions(hub: Hub, node: EchoNode) -> None:
     station = RawStation(hub.spec)
     assert len(station.ask(0x21, b"\x09" + COUNT)) == 1
     server.stop()
-    station.bus.close()
     assert node.links_lost == ["can:f1"]
     assert node.seen == [("can:f1", False)]
+    server.start()
+    assert len(station.ask(0x21, b"\x0a" + COUNT)) == 1, "it can begin again"
+    server.stop()
+    station.bus.close()
 
 
 def announces(hub: Hub) -> list[Announce]:

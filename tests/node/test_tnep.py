@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -105,6 +107,26 @@ def test_a_repeated_frame_is_not_run_again_until_the_field_was_gone(desk: Desk) 
     assert desk.handler.lost_lines == ["nfc"]
     assert desk.poller().transact(7, frame) != first
     assert len(desk.handler.frames) == 2
+
+
+def test_a_reply_is_kept_for_20_seconds_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A commit may take seconds: counted from the request, a repetition would run it again."""
+    now, ran = [1000.0], list[bytes]()
+
+    def slow(_line: str, frame: bytes, *, tapped: bool) -> bytes:
+        assert tapped
+        ran.append(frame)
+        now[0] += 12
+        return bytes([len(ran)])
+
+    tag = TnepTag(Type4Memory(500), cast("Any", SimpleNamespace(request=slow)), wt_int=4, n_wait=15)
+    monkeypatch.setattr(charging, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    commit = bytes.fromhex("000001030000")
+    assert tag._run(7, commit) == b"\1"
+    now[0] += 19
+    assert tag._run(7, commit) == b"\1"
+    now[0] += 20
+    assert (tag._run(7, commit), ran) == (b"\2", [commit] * 2)
 
 
 def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk) -> None:

@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.node.wrapped import canopen_device, iio_device
 from teds_provision.node.wrapped.canopen_reader import CanopenReader, DeviceReader
@@ -330,6 +331,14 @@ def test_an_iio_device_is_sampled_at_the_frequency_that_it_states(
     (channel,) = describe(f"iio:adc?root={tmp_path}").channels
     assert channel.period == period
     assert (channel.note == "") is stated
+
+
+def test_another_device_of_that_name_is_not_read_for_the_node(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    sysfs(**PRESSURE)
+    place, origin = SensorPlace(f"iio:bmp280?root={tmp_path}"), describe(f"iio:bmp280?root={tmp_path}").origin
+    with pytest.raises(PolicyError, match="not the file that the node was made from") as no:
+        WrappedRun(place, [replace(origin, name="bmp388")], lambda _: lambda *_: None, print)
+    assert no.value.hint == "Give the file that it was made from, or create a new node: node create DIR --from …"
 
 
 def test_iio_files_are_read_one_by_one_and_one_that_fails_says_why(sysfs: Callable[..., Path], tmp_path: Path) -> None:

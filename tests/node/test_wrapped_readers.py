@@ -207,6 +207,34 @@ def test_a_name_of_a_teds_has_120_octets_and_no_half_letter(name: str, cut: str)
     assert description._cut(name) == cut
 
 
+def test_what_was_enabled_last_is_disabled_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel refuses a scan element as long as its buffer runs."""
+    written: list[tuple[str, str]] = []
+    monkeypatch.setattr(Path, "write_text", lambda path, text: written.append((path.name, text)))
+    for folder, name in (("scan_elements", "in_x_en"), ("scan_elements", "in_y_en"), ("buffer", "enable")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / name).touch()
+    device = SimpleNamespace(folder=tmp_path, character=tmp_path, name="accel", period=0.01)
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EBUSY, "Device or resource busy")
+
+    flags = {name: getattr(os, name) for name in ("O_RDONLY", "O_NONBLOCK", "O_CLOEXEC")}
+    monkeypatch.setattr(iio_reader, "os", SimpleNamespace(open=refuse, **flags))
+    told: list[str] = []
+    made: Any = IioReader.__new__(IioReader)
+    made._device, made._notify, made._enabled, made._descriptor = device, told.append, [], -1
+    channels: Any = [SimpleNamespace(name="x"), SimpleNamespace(name="y")]
+    assert made._open_buffer(channels) is False
+    order = [("in_x_en", "1"), ("in_y_en", "1"), ("enable", "1"), ("enable", "0"), ("in_y_en", "0"), ("in_x_en", "0")]
+    assert written == order
+    assert told == ["The buffer of accel cannot be used (Device or resource busy): its files are read one by one."]
+    made._stop, made._thread = SimpleNamespace(set=lambda: None), None
+    made._enabled = [tmp_path / "buffer0", tmp_path / "buffer1"]
+    made.stop()
+    assert written[6:] == [("buffer1", "0"), ("buffer0", "0")]
+
+
 def test_a_buffer_that_may_not_be_used_leaves_its_elements_as_they_were(tmp_path: Path) -> None:
     told: list[str] = []
     (tmp_path / "scan_elements").mkdir()

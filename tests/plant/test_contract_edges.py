@@ -348,6 +348,38 @@ def test_a_head_that_is_not_of_its_form_is_passed_over_alone(head: Any, kept: bo
     assert found == ({**good, "d" * 64: (head[0], head[1])} if kept else good)
 
 
+def test_a_page_has_at_most_2048_heads_or_none_is_read() -> None:
+    heads = {f"{number:064x}": [number, H] for number in range(2048)}
+    assert len(page._heads(heads)) == 2048
+    assert page._heads({**heads, "f" * 64: [1, H]}) == {}
+    assert page._heads(list(heads)) == {}
+
+
+@pytest.mark.parametrize(
+    ("n", "previous", "good"),
+    [(1, "", True), (1, None, False), (1, ..., False), (1, H, False), (1, 0, False), (1, [], False), (2, H, True),
+     (2, "", False), (2, H.upper(), False), (2, H[:-1], False)],
+)  # fmt: skip
+def test_a_page_names_the_one_before_and_the_first_one_none(n: int, previous: object, good: bool) -> None:
+    draft = page.PageDraft(REGISTRY, 1, "", "0" * 16, NOW, {}, (1, "0" * 64))
+    members = {**json.loads(payload_of(page.sign_page(draft, [], ANYBODY))), "n": n, "previous": previous}
+    if previous is ...:
+        del members["previous"]
+    octets = sign_document(members, ANYBODY, document.PAGE)
+    if good:
+        assert page.open_page(octets, REGISTRY, lambda kid: ANYBODY.point).previous == previous
+        return
+    with pytest.raises(BadDataError, match="previous is not H of the page before"):
+        page.open_page(octets, REGISTRY, lambda kid: ANYBODY.point)
+
+
+@pytest.mark.parametrize("around", [b"", b"\n", b" \r\n"])
+def test_an_answer_of_the_office_may_have_a_line_end_of_an_editor(around: bytes) -> None:
+    sealed = signing.seal_answer(signing.Answer(H, refused="full", why="no unit is left"), ANYBODY)
+    found = signing.open_answer(around + sealed + around, lambda kid: ANYBODY.point)
+    assert found == signing.Answer(H, refused="full", why="no unit is left")
+
+
 def test_a_page_of_no_such_day_has_no_time() -> None:
     draft = page.PageDraft(REGISTRY, 1, "", "0" * 16, NOW, {}, (1, "0" * 64))
     members = json.loads(payload_of(page.sign_page(draft, [], ANYBODY)))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import sys
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
-from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
@@ -17,10 +19,22 @@ from teds_provision.protocol.announce import AddressClaim, Announce
 from teds_provision.protocol.handover import bundle as bundles
 from teds_provision.protocol.handover import jose, strict_json
 from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_pieces
+from teds_provision.protocol.handover.envelope import _SplitJws
 from teds_provision.protocol.handover.strict_json import base64url, dump
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem, node_key_message, to_pem, verify_each_once
+from teds_provision.protocol.keys import (
+    SoftwareKey,
+    fingerprint,
+    from_pem,
+    node_key_message,
+    station_key_message,
+    to_pem,
+    verify_der,
+    verify_each_once,
+)
 from teds_provision.protocol.messages import smp
+from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.messages.message import compose_command, compose_service
+from teds_provision.protocol.messages.tables import describe_request
 from teds_provision.protocol.plant.signing import require_name
 from teds_provision.protocol.session import unpad
 from teds_provision.protocol.wire_agreement import StationAgreement
@@ -29,6 +43,7 @@ from tests.protocol.desk import CREDENTIALS, UUID
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, STRANGER, bundle, node, trusts
 
 KEY = SoftwareKey(77)
+GOOD_JWK = jose.public_jwk(KEY.point)
 
 
 @pytest.mark.parametrize(
@@ -254,3 +269,118 @@ def test_elements_of_a_long_list_are_made_one_by_one_and_the_octets_are_used_up(
     assert empty == {"nodes": []}
     other = strict_json.load_long(bytearray(b'{"nodes":{"a":1}}'), "The bundle", "nodes", lambda value: value)
     assert other == {"nodes": {"a": 1}}
+
+
+@pytest.mark.parametrize(
+    ("jwk", "why"),
+    [
+        (None, "It is not a JSON Web Key."),
+        ([], "It is not a JSON Web Key."),
+        ({"kty": "oct", "k": "AAAA"}, "It holds a private or secret key where a public one belongs."),
+        (GOOD_JWK | {"d": "AAAA"}, "It holds a private or secret key where a public one belongs."),
+        (GOOD_JWK | {"kty": "RSA"}, "It is not a P-256 key; stations, CAs and nodes have P-256 keys."),
+        (GOOD_JWK | {"crv": "P-384"}, "It is not a P-256 key; stations, CAs and nodes have P-256 keys."),
+        (GOOD_JWK | {"x": GOOD_JWK["x"] + "AAA"}, "It has coordinates that are not 32 octets each."),
+        (GOOD_JWK | {"y": ""}, "It has coordinates that are not 32 octets each."),
+        (GOOD_JWK | {"y": GOOD_JWK["x"]}, "It is not a point of the curve P-256."),
+        (GOOD_JWK | {"kid": "me", "use": "sig", "alg": "ES256"}, None),
+    ],
+)
+def test_a_key_of_a_document_is_a_public_point_or_named_for_what_it_is(jwk: Any, why: str | None) -> None:
+    if why is None:
+        assert jose.point_of(jwk, "It") == KEY.point
+        return
+    with pytest.raises(BadDataError) as no:
+        jose.point_of(jwk, "It")
+    assert no.value.message == why
+
+
+def test_a_sealed_document_beyond_its_bound_is_not_parsed() -> None:
+    sealed = jose.encrypt(b"{}", [KEY.point], cty="JWS")
+    longer = sealed + b" " * (4096 - len(sealed))
+    assert jose.decrypt(longer, KEY, cty="JWS", max_octets=4096) == b"{}"
+    with pytest.raises(BadDataError, match="The sealed document has 4097 octets; at most 4096 are read"):
+        jose.decrypt(longer + b" ", KEY, cty="JWS", max_octets=4096)
+
+
+@pytest.mark.parametrize(("count", "found"), [(1, 2), (3, 2), (0, 2)])
+def test_a_bundle_is_not_written_with_more_or_fewer_nodes_than_it_counts(count: int, found: int) -> None:
+    with pytest.raises(BadDataError, match=f"to hold {count} different nodes, and holds {found}"):
+        list(payload_pieces(bundle(), [node(1), node(2)], count))
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (b"aGVhZA.YWJj.c2ln", (b"aGVhZA", b"c2ln", b"abc")),
+        (b"aGVhZA.YWJj", None),
+        (b"aGVhZA.YWJj.c2ln.", None),
+        (b"aGVhZA.YWJj.c2ln.YQ", None),
+        (b"aGVhZA", None),
+    ],
+)
+@pytest.mark.parametrize("size", [1, 7, 100])
+def test_what_is_inside_a_sealed_bundle_has_three_parts_however_it_comes(
+    text: bytes, parts: tuple[bytes, bytes, bytes] | None, size: int
+) -> None:
+    jws = _SplitJws()
+    for at in range(0, len(text), size):
+        jws.more(text[at : at + size])
+    assert jws.sha256 == hashlib.sha256(text).hexdigest()
+    if parts is None:
+        with pytest.raises(BadDataError, match="three parts"):
+            jws.signed()
+        return
+    header, signature, digest = jws.signed()
+    assert (header, signature, bytes(jws.payload())) == parts
+    assert digest == hashlib.sha256(b"aGVhZA.YWJj").digest()
+
+
+@pytest.mark.parametrize(
+    ("changes", "good"),
+    [({}, True), ({"station_key": None}, False), ({"station_key_signature": None}, False),
+     ({"station_key": b"\4" + bytes(64)}, False), ({"station_key": KEY.point[:-1]}, False)],
+)  # fmt: skip
+def test_the_key_of_a_station_is_a_point_before_a_node_s_chip_is_asked(changes: dict[str, Any], good: bool) -> None:
+    asked: list[tuple[bytes, bytes, bytes]] = []
+
+    def chip(point: bytes, message: bytes, signature: bytes) -> bool:
+        asked.append((point, message, signature))
+        return True
+
+    teds = SimpleNamespace(station_key=KEY.point, station_key_signature=bytes(64))
+    vars(teds).update(changes)
+    assert datasheet.station_signature_good(cast("Any", teds), STRANGER.point, chip) is good
+    assert asked == ([(STRANGER.point, station_key_message(KEY.point), bytes(64))] if good else [])
+    assert not datasheet.station_signature_good(cast("Any", teds), STRANGER.point), "the signature is of nobody"
+
+
+def test_a_der_signature_is_of_a_point_over_a_message_or_no_good() -> None:
+    signer = ec.generate_private_key(ec.SECP256R1())
+    point = signer.public_key().public_bytes(serialization.Encoding.X962, serialization.PublicFormat.UncompressedPoint)
+    signature = signer.sign(b"message", ec.ECDSA(hashes.SHA256()))
+    assert verify_der(point, b"message", signature)
+    for wrong in (
+        (point, b"messagf", signature),
+        (KEY.point, b"message", signature),
+        (b"\4" + bytes(64), b"message", signature),
+        (b"", b"message", signature),
+        (point, b"message", b""),
+        (point, b"message", signature[:-1]),
+    ):
+        assert not verify_der(*wrong)
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (Command(1, 1, 2, b"\x05\0\0\1\0"), "Read (1.2), 5 octets: TEDS 5 of channel 1 from octet 256"),
+        (Command(0, 1, 3, b"\x0c\0\0\0\7abc"), "Write (1.3), 8 octets: TEDS 12 of channel 0 from octet 7"),
+        (Command(2, 1, 3, b"\x03\0\0\0"), "Write (1.3), 4 octets: TEDS 3 of channel 2"),
+        (Command(0, 1, 1, b"\x10\0\0\0\7"), "Query (1.1), 5 octets: TEDS 16 of channel 0"),
+        (Command(0, 1, 2, b""), "Read (1.2), 0 octets"),
+        (Command(0, 128, 8, bytes(31)), "Prove (128.8), 31 octets"),
+    ],
+)
+def test_a_command_of_teds_is_described_with_its_teds_and_its_place(command: Command, words: str) -> None:
+    assert describe_request(command) == words

@@ -52,7 +52,13 @@ def test_what_a_statement_says() -> None:
 
 @pytest.mark.parametrize(
     ("changes", "why"),
-    [({"reason": "stolen"}, "stolen"), ({"reason": ...}, "lost"), ({"reason": None}, "lost"), ({"why": ...}, "lost")],
+    [
+        ({"reason": "stolen"}, "stolen"),
+        ({"reason": ""}, ""),
+        ({"reason": ...}, "lost"),
+        ({"reason": None}, "lost"),
+        ({"why": ...}, "lost"),
+    ],
 )
 def test_the_reason_counts_before_that_of_earlier_versions(changes: dict[str, object], why: str) -> None:
     assert open_revocation(statement(**changes), known).why == why

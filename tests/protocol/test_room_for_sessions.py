@@ -12,10 +12,11 @@ from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import CommandRefusedError, Function, Reason, security_command
 from teds_provision.protocol.session import NodeSession, StationSession, open_mac
+from teds_provision.protocol.tim import Tim
 from teds_provision.protocol.tim.node_sessions import OpenedFrame, Sessions
 from teds_provision.protocol.wire_agreement import key_id
 
-from .desk import NODE, STATION, UUID
+from .desk import NODE, STATION, UUID, Desk
 
 KEY = bytes(range(16))
 INNER = security_command(Function.IDENTIFY)
@@ -255,3 +256,14 @@ def test_what_ends_a_session() -> None:
     room.sessions.end_all()
     assert room.ended == [first, second, third, fourth]
     assert room.alive("can:f1", "can:f2", "nfc") == [False, False, False]
+
+
+@pytest.mark.parametrize("places", [2, 3])
+def test_a_node_has_as_many_sessions_as_it_was_made_with(places: int) -> None:
+    desk = Desk().agree()
+    desk.tim = Tim(NODE, desk.memory, lambda: desk.now, sessions=places)
+    links = [f"can:{number:02x}" for number in range(0xE1, 0xE1 + places + 1)]
+    for link in links:
+        desk.now += 1
+        desk.open(link=link)
+    assert [desk.tim._sessions.any_on(link) for link in links] == [False] + [True] * places

@@ -256,12 +256,15 @@ def test_the_station_checks_length_point_tag_proof_and_epoch_in_this_order() -> 
         answered.accept(everything + b"\0", epoch=1)
     with pytest.raises(NotAuthenticError, match="one-time key"):
         answered.accept(everything, epoch=1)
-    with pytest.raises(TranscriptMismatchError):
+    with pytest.raises(TranscriptMismatchError) as tag:
         answered.accept(bent(answered.reply(signer=CA), TAG_AT), epoch=1)
-    with pytest.raises(NotAuthenticError, match="sigN"):
+    with pytest.raises(NotAuthenticError, match="sigN") as proof:
         answered.accept(answered.reply(signer=CA), epoch=1)
-    with pytest.raises(PolicyError, match="offers key epoch 1"):
+    with pytest.raises(PolicyError, match="offers key epoch 1") as stale:
         answered.accept(answered.reply(), epoch=1)
+    assert "try again at the reader" in tag.value.hint
+    assert "Do not use it" in proof.value.hint
+    assert "take it to the bench and reset it by hand" in stale.value.hint
     assert answered.accept(answered.reply()).epoch == 1
 
 

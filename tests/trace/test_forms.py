@@ -134,6 +134,7 @@ def test_frames_of_the_bus_are_named(identifier: int, octets: str, words: str) -
         ("a205deadbeef", "out", "WRITE of page 5"),
         ("00a4040007", "out", "SELECT"),
         ("00b0000010", "out", "READ BINARY"),
+        ("00b00000", "out", "READ BINARY"),
         ("00d6000002", "out", "UPDATE BINARY"),
         ("00a404", "out", "3 octets"),
         ("0a", "in", "ACK"),

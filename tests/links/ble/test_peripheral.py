@@ -109,6 +109,30 @@ def test_it_advertises_flags_and_the_service_and_nothing_that_names_the_node(
     assert scene.device.scan_response_data == b""  # type: ignore[attr-defined]
 
 
+def test_a_restart_drops_every_connection_even_one_that_does_not_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene(tmp_path, monkeypatch, factory=False)
+    names = {scene.connect() for _ in range(3)}
+    scene.sessions |= names
+
+    async def fails() -> None:
+        raise OSError("the connection has ended")
+
+    lines = list(scene.peripheral._lines.values())
+    lines[0].connection.disconnect = fails
+
+    async def restart() -> None:
+        scene.peripheral.restarted()
+        await asyncio.gather(*scene.peripheral._dropping)
+
+    asyncio.run(restart())
+    ble_peripheral._finish_turns(lines)
+    scene.peripheral._workers.end()
+    assert (scene.links, scene.peripheral._dropping) == (set(), set())
+    assert set(scene.lost) == names
+
+
 def test_a_connection_without_a_session_is_dropped_after_10_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
