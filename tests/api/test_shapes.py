@@ -118,6 +118,39 @@ def test_a_body_is_utf_8_without_a_byte_order_mark(form: str) -> None:
         read(bodies.NewGroup, text.encode(form))
 
 
+NO_JSON = "The request body is not valid JSON."
+
+
+@pytest.mark.parametrize(
+    ("octets", "message", "hint"),
+    [
+        (b'{"name": NaN}', NO_JSON, ""),
+        (b'{"name": -Infinity}', NO_JSON, ""),
+        (b'{"name": "\\ud83d"}', NO_JSON, ""),
+        (b'{"name": "\\ude00\\ud83d"}', NO_JSON, ""),
+        (b'{"uuids": ["a", "\\udc00"]}', NO_JSON, ""),
+        (b'{"\\ud83d": 1}', NO_JSON, ""),
+        (b'{"name": "\xed\xa0\xbd"}', NO_JSON, ""),
+        (b"[" * 100_000, NO_JSON, ""),
+        (b'{"name": ' + b"1" * 5000 + b"}", NO_JSON, ""),
+        (b" ", NO_JSON, ""),
+        (b'{"name": 1, "name": 1}', "Member 'name' appears twice.", "Send each member once."),
+        (b'{"%b": 1, "%b": 1}' % (b"x" * 65, b"x" * 65), f"Member '{'x' * 64}' appears twice.",
+         "Send each member once."),
+        (b"[]", "The request body must be a JSON object.", ""),
+        (b"null", "The request body must be a JSON object.", ""),
+    ],
+)  # fmt: skip
+def test_a_body_with_two_meanings_or_none_is_refused(octets: bytes, message: str, hint: str) -> None:
+    with pytest.raises(BadRequestError) as refused:
+        read(bodies.NewGroup, octets)
+    assert (refused.value.message, refused.value.hint) == (message, hint)
+
+
+def test_both_halves_of_a_surrogate_pair_are_one_character() -> None:
+    assert read(bodies.NewGroup, b'{"name": "\\ud83d\\ude00", "uuids": []}').name == "\U0001f600"
+
+
 def test_a_member_that_is_null_is_as_one_that_is_not_there() -> None:
     assert read(bodies.NewVirtual, b'{"profile": "gripper", "name": null}') == bodies.NewVirtual(profile="gripper")
     with pytest.raises(BadRequestError, match="'mode' must be"):

@@ -151,3 +151,20 @@ def test_a_global_option_that_is_none_of_the_command_is_named_as_one(
     error = json.loads(capsys.readouterr().out)["error"]
     assert (code, error["code"], error["hint"]) == (2, "usage", hint)
     assert error["message"].endswith("(see: teds-provision nodes --help)")
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (["whitlist"], "No such command 'whitlist'. Did you mean 'whitelist'?"),
+        (["whitlist", "verfy"], "No such command 'whitlist'. Did you mean 'whitelist'?"),
+        (["verfy", "--json", "node"], "No such command 'verfy'. Did you mean 'verify'?"),
+        (["xyzzy", "verify"], "No such command 'xyzzy'."),
+    ],
+)
+def test_the_command_that_is_nearest_to_the_one_that_was_typed_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, typed: list[str], message: str
+) -> None:
+    code = main.run(["--json", "--home", str(tmp_path), *typed])
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (code, error["message"]) == (2, f"{message} (see: teds-provision --help)")

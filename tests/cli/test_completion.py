@@ -182,3 +182,30 @@ def test_without_a_store_or_with_a_broken_one_nothing_is_offered(home: Path, tmp
     assert shell_completion._items(there, broken) == []
     found = shell_completion._items(there, lambda _station: [("a", "b\nc"), ("two\nlines", "x")])
     assert [item.value for item in found] == ["a"], "no word of two lines"
+
+
+def test_what_begins_otherwise_is_not_offered(home: Path) -> None:
+    """A word from the middle of a name would be put in the place of what was typed."""
+    uuid = "8d4d9da65281f7000007"
+    assert call(home, "whitelist", "add", uuid, "--name", "left hand").code == 0
+    for name in ("left hand", "hand", "Hand"):
+        assert call(home, "group", "create", name, uuid).code == 0
+    ctx: Any = SimpleNamespace(
+        find_root=lambda: SimpleNamespace(params={"home": home}), command_path="teds-provision nodes"
+    )
+
+    def offers(parameter: click.Parameter, begun: str) -> list[str]:
+        offer = shell_completion._offer_for(parameter)
+        assert offer is not None
+        return [item.value if item.type == "plain" else item.type for item in offer(ctx, parameter, begun)]
+
+    group, node = click.Option(["--group"]), click.Argument(["uuid"])
+    assert (offers(group, "hand"), offers(group, "left"), offers(group, "eft")) == (["hand"], ["left hand"], [])
+    assert (offers(node, "hand"), offers(node, "left"), offers(node, "d4d")) == (["file"], ["left hand"], ["file"])
+    assert offers(click.Argument(["what"]), "left") == ["left hand", "left hand"], "the group and the node"
+
+
+def test_in_a_list_of_zsh_only_what_has_a_description_is_escaped() -> None:
+    zsh = shell_completion.Zsh(click.Command("x"), {}, "x", "x")
+    assert zsh.format_completion(shell_completion.CompletionItem("a\\b")) == "plain\na\\b\n_"
+    assert zsh.format_completion(shell_completion.CompletionItem("a\\b", help="an arm")) == "plain\na\\\\b\nan arm"

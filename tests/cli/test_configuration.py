@@ -243,6 +243,10 @@ def test_a_line_is_put_where_a_person_would_put_it() -> None:
         ("can = 1\n[x]\ncan = 2\n", "", "can", None, "[x]\ncan = 2\n"),
         ("[x]\ncan = 2\n", "", "can", None, "[x]\ncan = 2\n"),
         ("[x]\nno_scalars = true\n", "x", "no-scalars", False, "[x]\nno_scalars = false\n"),
+        ('["x"]\ncan = 2\n', "x", "can", "y", '["x"]\ncan = "y"\n'),
+        ("[ 'x' . import_keys ]\ncan = 2\n", "x import-keys", "can", "y", "[ 'x' . import_keys ]\ncan = \"y\"\n"),
+        ("[x]\na = 1\n[y]\n[x.y]\na = 2\n", "x y", "a", 3, "[x]\na = 1\n[y]\n[x.y]\na = 3\n"),
+        ("can = 1\n", "log", "last", None, "can = 1\n"),
     ):  # fmt: skip
         assert _edited(text, table.split(), key, value) == after, (text, table, key)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 import pytest
+from rich.table import Table
 
 from teds_provision.cli import context
 from teds_provision.cli.context import App, read_line, to_json
@@ -229,3 +230,87 @@ def test_notes_and_warnings_of_each_kind_of_run(tmp_path: Path, capsys: pytest.C
         app.note("b", level=1)
         app.warn("w")
         assert capsys.readouterr().err.splitlines() == shown, facts
+
+
+@pytest.mark.parametrize(
+    ("facts", "do"),
+    [
+        ({}, lambda app: app.emit({}, "done")),
+        ({}, lambda app: app.emit({}, Table("done"))),
+        ({}, lambda app: app.emit({}, lambda console: console.print("done"))),
+        ({"as_json": True}, lambda app: app.emit({"done": True})),
+        ({}, lambda app: app.lines(["done"])),
+        ({}, lambda app: app.note("done")),
+        ({}, lambda app: app.warn("done")),
+        ({}, lambda app: app.fail_line(REFUSED)),
+        ({"as_json": True}, lambda app: app.fail_line(REFUSED)),
+        ({}, lambda app: app.ask_yes_no("done?")),
+        ({}, lambda app: app.ask_text("done?", "")),
+        ({}, lambda app: app.ask_for_key("done?", "ab" * 32)),
+        ({}, lambda app: app.ask_secret("done?")),
+        ({}, lambda app: app.ask_new("done?")),
+    ],
+)
+@pytest.mark.usefixtures("terminal")
+def test_the_live_line_is_removed_before_anything_is_printed_or_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, facts: dict[str, Any], do: Any
+) -> None:
+    """What came behind it would stand in the same line, and be overwritten."""
+    course: list[str] = []
+
+    class Stream(io.StringIO):
+        def write(self, text: str) -> int:
+            course.extend(["shown"] if text.strip() else [])
+            return len(text)
+
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, Stream())
+    for name in ("confirm", "prompt"):
+        monkeypatch.setattr(click, name, lambda *_, **__: course.append("shown") or "n")
+    app = App(home=tmp_path, **facts)
+    app.live_line = lambda: course.append("removed")
+    do(app)
+    assert (course[0], "shown" in course) == ("removed", True)
+
+
+@pytest.mark.usefixtures("terminal")
+@pytest.mark.parametrize(
+    ("default", "answer", "question", "text"),
+    [
+        ("", " left thumb ", "Its name", "left thumb"),
+        ("thumb", "", "Its name [thumb]", "thumb"),
+        ("thumb", " index\t", "Its name [thumb]", "index"),
+        ("", "", "Its name", ""),
+    ],
+)
+def test_a_text_that_is_typed_has_no_blanks_around_it_and_an_empty_one_is_the_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, default: str, answer: str, question: str, text: str
+) -> None:
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    def prompt(shown: str, **how: Any) -> str:
+        asked.append((shown, how))
+        return answer or how["default"]
+
+    monkeypatch.setattr(click, "prompt", prompt)
+    assert App(home=tmp_path).ask_text("Its name", default) == text
+    assert asked == [(question, {"default": default, "err": True, "show_default": False})]
+
+
+def test_messages_and_questions_are_broken_at_the_edge_of_stderr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """stdout may be a file meanwhile, or another terminal."""
+    asked: list[Any] = []
+    monkeypatch.setattr(context, "folded", lambda text, stream, **how: asked.append((stream, how)) or text)
+    for name in ("confirm", "prompt"):
+        monkeypatch.setattr(click, name, lambda *_, **__: "n")
+    app = App(home=tmp_path)
+    app.note("a note")
+    app.ask_yes_no("Reset it?")
+    app.ask_text("Its name", "")
+    assert asked == [
+        (sys.stderr, {}),
+        (sys.stderr, {"spare": len(" [y/N]: ")}),
+        (sys.stderr, {"spare": len(" [y/N]: ")}),
+    ]

@@ -18,6 +18,7 @@ import pytest
 
 from teds_provision.demo import page, story
 from teds_provision.errors import LinkError, TedsProvisionError
+from teds_provision.provisioning.progress import SilentReporter, Steps
 
 from .shell import clean_environment
 
@@ -267,3 +268,118 @@ def test_the_demo_of_the_page_says_where_it_is_and_what_to_type_and_leaves_nothi
     profile = ["--profile", "temperature-sensor", "--name", "oven"]
     assert ran == [["--json", "node", "create", str(folder / "oven"), *profile]]
     assert (len(said), folder.exists(), measured) == (2, False, [api])
+
+
+# -- the story's steps, without nodes ----------------------------------------------------------------------------------
+
+
+def demo_in(folder: Path, **facts: Any) -> Any:
+    """Return a demo whose steps are real and whose links lead nowhere."""
+    return SimpleNamespace(
+        folder=folder, uuid=bytes(10), can="virtual:demo", reporter=None, over=lambda via: via,
+        steps=Steps(SilentReporter()), **facts,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("taken_before", "rotated", "reached"),
+    [(False, False, True), (False, True, True), (True, True, True), (False, False, False)],
+)
+def test_the_story_says_to_whom_a_key_is_sealed_and_stops_where_the_node_was_not_reached(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, taken_before: bool, rotated: bool, reached: bool
+) -> None:
+    first, second = (SimpleNamespace(name=name, fingerprint=digits * 32) for name, digits in (("a", "aa"), ("b", "bb")))
+    (tmp_path / "move.jwe").write_bytes(b"sealed")
+    taken = story.ImportResult.__new__(story.ImportResult)
+    object.__setattr__(taken, "receipt", b"receipt")
+    object.__setattr__(taken, "row", SimpleNamespace(body="{}", id="7"))
+    imported: Any = SimpleNamespace(receipt=b"receipt", uuids=[bytes(10)])
+    proof = story.NodeProof.__new__(story.NodeProof)
+    object.__setattr__(proof, "rotated", rotated)
+    outcome: Any = proof if reached else SimpleNamespace(why="It is away.")
+    closed: list[Any] = []
+    monkeypatch.setattr(story.ImportResult, "uuids", [bytes(10)], raising=False)
+    monkeypatch.setattr(story, "plan_export", lambda _station, order: order)
+    monkeypatch.setattr(story, "export_bundle", lambda _station, order, path: SimpleNamespace(octets=len(order.mode)))
+    monkeypatch.setattr(story, "plan_import", lambda _station, _octets: taken if taken_before else "plan")
+    monkeypatch.setattr(story, "import_bundle", lambda _station, _plan: imported)
+    monkeypatch.setattr(story, "prove_nodes", lambda _station, *_words: [outcome])
+    monkeypatch.setattr(story, "close", lambda station, receipt: closed.append((station.name, receipt)))
+    demo = demo_in(tmp_path)
+    if not reached:
+        with pytest.raises(LinkError, match=r"^The node was not reached after the import: It is away\.$"):
+            story._send(demo, first, second, "move")  # type: ignore[arg-type]
+        assert closed == []
+        return
+    story._send(demo, first, second, "move")  # type: ignore[arg-type]
+    assert [(step.name, step.detail) for step in demo.steps.done] == [
+        ("export-keys", f"move: 4 octets, sealed to {'bb' * 8}"),
+        ("import-keys", f"proven in a session{', key rotated, the sender is locked out' if rotated else ''}"),
+        ("receipt", "a has b's signed receipt"),
+    ]
+    assert closed == [("a", b"receipt")]
+
+
+@pytest.mark.parametrize("error", [None, LinkError("The bus is off.")])
+def test_a_measurement_of_the_story_that_fails_ends_it_and_its_bus_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception | None
+) -> None:
+    closed: list[str] = []
+    streams = [{"samples": 30, "lost": 1}, {"samples": 12, "lost": 2}]
+    ended = SimpleNamespace(error=error, nodes=[{"streams": streams[:1]}, {"streams": streams[1:]}])
+    made: list[Any] = []
+    monkeypatch.setattr(story, "open_port", lambda _can: SimpleNamespace(close=lambda: closed.append("port")))
+    monkeypatch.setattr(story.sinks, "open_sink", lambda name: name)
+    monkeypatch.setattr(story.buses_room, "Buses", lambda _ports: nullcontext("buses"))
+    monkeypatch.setattr(
+        story.measurement, "Measurement",
+        lambda *words: made.append(words) or SimpleNamespace(run=lambda _stop, seconds: ended),
+    )  # fmt: skip
+    monkeypatch.setattr(story, "_last_row", lambda file: f"row of {file.name}")
+    groups: list[Any] = []
+    station: Any = SimpleNamespace(name="a", groups=SimpleNamespace(create=lambda *words: groups.append(words)))
+    demo, uuids = demo_in(tmp_path), (bytes(10), bytes(range(10)))
+    if error is not None:
+        with pytest.raises(LinkError, match="The bus is off"):
+            story.measure_group(demo, station, uuids)
+        assert (closed, demo.steps.done) == (["port"], [])
+        return
+    story.measure_group(demo, station, uuids)
+    [step] = demo.steps.done
+    assert (step.name, step.detail) == ("measure", "group robot, 2 nodes: 42 values, 3 lost; last row of run.csv")
+    assert (closed, groups, made[0][5].group) == (["port"], [("robot", list(uuids))], "robot")
+
+
+def test_the_newest_value_of_each_column_with_a_unit_is_shown(tmp_path: Path) -> None:
+    file = tmp_path / "run.csv"
+    file.write_text(
+        "# head\ntime,hand/opening [m],hand/force [N],arm/angle [°],note\n1,0.01,,,x\n2,0.04,2.34567,,y\n3,,,,z\n"
+    )
+    assert story._last_row(file) == "opening 0.04 m, force 2.346 N, angle none"
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_node_of_the_story_ends_with_its_block_and_is_killed_if_it_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: bool
+) -> None:
+    course: list[Any] = []
+
+    def wait(seconds: float | None = None) -> None:
+        course.append(("wait", seconds))
+        if seconds is not None and not ends:
+            raise subprocess.TimeoutExpired("node", seconds)
+
+    process = SimpleNamespace(
+        terminate=lambda: course.append("terminate"), kill=lambda: course.append("kill"), wait=wait
+    )
+    monkeypatch.setattr(story.subprocess, "Popen", lambda words, **_how: course.append(words[3:]) or process)
+    monkeypatch.setattr(story, "_ready", lambda _process: b"uuid")
+    with story.run_node(tmp_path, "--nfc", "udp:1") as uuid:
+        assert uuid == b"uuid"
+        assert len(course) == 1
+    assert course == [
+        ["--json", "node", "run", str(tmp_path), "--nfc", "udp:1"],
+        "terminate",
+        ("wait", 5.0),
+        *([] if ends else ["kill", ("wait", None)]),
+    ]

@@ -127,3 +127,36 @@ def test_what_a_file_is_shows_in_its_beginning(tmp_path: Path, octets: bytes, ki
     assert found == kind
     assert _kind_of(tmp_path) is None
     assert _kind_of(tmp_path / "none") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "octets", "message", "hint"),
+    [
+        ("b.backup", b'{"format":"teds-backup/2"}', "{} holds no TEDS: it is a backup of a station.",
+         "Read it with: teds-provision restore {}"),
+        ("r.mcap", b"\x89MCAP0\r\n", "{} holds no TEDS: it is a recording (MCAP).", "Read it with: mcap info {}"),
+        ("report.pdf", b"%PDF-1.7\n", "{} holds no TEDS: it is neither binary nor hex (read as hex: line 1 holds '%', "
+         "which is no hex digit).", "{} is a PDF. TEDS come as binary, hex, Intel HEX, JSON, XML, an image, a profile "
+         "or a bundle."),
+    ],
+)  # fmt: skip
+def test_a_kind_that_the_error_names_already_is_not_named_twice(
+    home: Path, tmp_path: Path, name: str, octets: bytes, message: str, hint: str
+) -> None:
+    file = tmp_path / name
+    file.write_bytes(octets)
+    error = call(home, "--json", "show", file).json["error"]
+    assert (error["message"], error["hint"]) == (message.format(file), hint.format(file))
+
+
+def test_a_file_that_cannot_be_opened_has_no_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own error is reported, without another one about the same file."""
+    file = tmp_path / "image.json"
+    file.write_text("{}")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    assert _kind_of(file) is None
+    assert _kind_of(Path("a\0b")) is None

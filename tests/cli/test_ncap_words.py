@@ -19,6 +19,7 @@ from teds_provision.cli.service import ncap as commands
 from teds_provision.cli.service.ncap import DaemonLog
 from teds_provision.errors import LinkError
 from teds_provision.measure.matching import MatchSurvey
+from teds_provision.ncap.web.tokens import Token, Tokens
 from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
 from tests.pace import PATIENCE
@@ -251,7 +252,7 @@ def test_what_is_measured_and_why_others_are_not(home: Path, running: Running, m
     ], "five are named without a remainder"
 
 
-def test_detection_address_and_tokens(home: Path, running: Running) -> None:
+def test_detection_address_and_tokens(home: Path, running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call(home, "ncap", "detection", "transparent").out == "Detection: transparent now.\n"
     assert call(home, "ncap", "open", "--read-only").out == "http://x/?read_only=True\n"
     assert call(home, "--json", "ncap", "open").json == {"url": "http://x/?read_only=False"}
@@ -265,6 +266,14 @@ def test_detection_address_and_tokens(home: Path, running: Running) -> None:
     (plotter, _) = call(home, "--json", "ncap", "token", "list").json["tokens"]
     assert set(plotter) == {"name", "kind", "read_only", "created", "until"}
     assert plotter["created"].endswith("Z")
+    assert (plotter["until"], plotter["read_only"], plotter["kind"]) == (None, True, "script"), "it has no end"
+    browser = Token("browser", "browser", "ab" * 32, created=1_795_000_000.0, until=1_795_003_600.0)
+    with monkeypatch.context() as patched:
+        patched.setattr(Tokens, "all", lambda _tokens: [browser])
+        assert call(home, "--json", "ncap", "token", "list").json["tokens"] == [
+            {"name": "browser", "kind": "browser", "read_only": False, "created": "2026-11-18T11:06:40Z",
+             "until": "2026-11-18T12:06:40Z"}
+        ]  # fmt: skip
     assert call(home, "--json", "ncap", "token", "remove", "plotter").json == {"removed": "plotter", "count": 1}
     assert call(home, "ncap", "token", "remove", "plotter").code == 3
 

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from teds_provision import firmware_image, provisioning
 from teds_provision.cli.context import App
+from teds_provision.cli.node.at_node import PressLines
 from teds_provision.cli.node.update import _ProgressTable
 from teds_provision.errors import (
     BoardLostError,
@@ -32,6 +33,7 @@ from teds_provision.provisioning.agree import AgreeReport, AgreeResult, ResetRec
 from teds_provision.provisioning.identify import IdentifiedNode, ProvenNode
 from teds_provision.provisioning.locate import LocatedNode
 from teds_provision.provisioning.meeting import Arrival
+from teds_provision.provisioning.progress import StepResult
 from teds_provision.provisioning.update import BoardUpdate, UpdatePlan
 from teds_provision.station.firmware import FirmwareReading, KnownFirmware
 
@@ -524,3 +526,76 @@ def test_an_update_is_of_boards_or_of_those_that_match(home: Path, tmp_path: Pat
     file.write_bytes(b"image")
     boards = [NODE] if words else []
     assert call(home, "--json", "update", *boards, file, *words, *NFC).code == 2
+
+
+def test_a_plan_names_everyone_whose_measurement_it_interrupts_and_one_to_do_nothing_none(updating: Any) -> None:
+    outcome, _ = updating({UUID: plan(interrupts=("ncap", "bench2"), seconds=7000 / 3000)}, [], "--dry-run")
+    digest = "ab" * 32
+    assert outcome.out.splitlines() == [
+        f"Plan for {NODE}: install 1.4.0 (image {digest}).",
+        "  now: 1.3.0+7, finger/app",
+        "  7000 octets, about 2 s if nothing else uses the link",
+        "  interrupts the measurement by ncap",
+        "  interrupts the measurement by bench2",
+    ]
+    still = plan(stage="nothing", octets=0, seconds=0.0, interrupts=())
+    assert updating({UUID: still}, [], "--dry-run")[0].out.splitlines() == [
+        f"Plan for {NODE}: nothing to do, it runs 1.4.0 (image {digest})."
+    ]
+    nameless: Any = SimpleNamespace(version=(1, 3, 0), build=7, text="")
+    assert "  now: 1.3.0+7, no name" in updating({UUID: plan(report=nameless)}, [], "--dry-run")[0].out.splitlines()
+
+
+def test_boards_of_a_plan_take_their_time_one_after_the_other(updating: Any) -> None:
+    plans = {
+        UUID: plan(),
+        OTHER: plan(OTHER, octets=500, seconds=6.25),
+        bytes.fromhex("ab" * 10): ended("refused", REFUSED, bytes.fromhex("ab" * 10)),
+    }
+    totals = lines_of(updating(plans, [], "--dry-run", as_json=True)[0])[-1]["totals"]
+    assert (totals["planned"], totals["refused"], totals["octets"], totals["seconds"]) == (2, 1, 7500, 9.8)
+    people = updating(plans, [], "--dry-run")[0]
+    assert people.out.splitlines()[-1] == "2 planned, 1 refused; 7500 octets, about 10 s one board after the other"
+    assert people.code == 6
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_of_several_boards_each_line_names_its_board_also_if_one_is_left(updating: Any, refused: bool) -> None:
+    def update(_station: Any, _links: Any, _orders: Any, reporter_of: Any, **_how: Any) -> Any:
+        reporter_of(UUID).finished(StepResult("upload", "done", 0.5))
+        yield ended("updated")
+
+    plans: dict[bytes, Any] = {UUID: plan()}
+    if refused:
+        plans[OTHER] = ended("refused", REFUSED, OTHER)
+    outcome, _ = updating(plans, update, "--yes")
+    line = f"{NODE}: ✓ upload" if refused else "✓ upload"
+    assert [text for text in outcome.err.splitlines() if text.startswith(line)] != []
+    assert outcome.out.splitlines()[-1].startswith("1 updated, 1 refused in " if refused else "1 updated in ")
+    assert outcome.code == (6 if refused else 0)
+
+
+def test_who_watches_has_a_line_for_each_press_and_all_else_is_progress_as_before() -> None:
+    course: list[Any] = []
+    inner: Any = SimpleNamespace(
+        started=lambda step: course.append(("started", step)),
+        finished=lambda step: course.append(("finished", step.name)),
+        notice=lambda notice: course.append(("notice", notice.text)),
+        written=lambda octets, total: course.append(("written", octets, total)),
+    )
+    app: Any = SimpleNamespace(emit=lambda result, text: course.append((result, text)))
+    lines = PressLines(app, inner)
+    lines.started("identify")
+    lines.finished(StepResult("identify"))
+    lines.written(7, 9)
+    lines.notice(Notice("waiting", "Tap it."))
+    lines.notice(Notice("pressed", "Somebody pressed."))
+    assert course == [
+        ("started", "identify"), ("finished", "identify"), ("written", 7, 9), ("notice", "Tap it."),
+        ("notice", "Somebody pressed."),
+    ]  # fmt: skip
+    course.clear()
+    lines.notice(Notice("pressed", "It was pressed.", uuid=UUID))
+    [(result, text)] = course
+    assert result.pop("time").endswith("Z")
+    assert (result, text) == ({"uuid": NODE, "pressed": True}, f"{NODE}  says it was pressed")

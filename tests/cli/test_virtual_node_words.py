@@ -408,6 +408,10 @@ def test_a_node_is_served_on_each_link_that_is_named(
         assert how["extras"].after() == (((bytes(6), True),) if "ble" in by_kind else ())
         assert how["extras"].before() == (("charge of power",) if charged else ())
         assert course == ([("field", True)] if charged else [])
+        how["extras"].field(present=False)
+        assert course[1:] == ([("field", False)] if charged else [])
+        battery.power = lambda: "later power"
+        assert how["extras"].before() == (("charge of later power",) if charged else ()), "as it is at the tap"
     course.clear()
     for call_it in (*restarted, *pressed):
         call_it()

@@ -243,3 +243,24 @@ def test_an_eui_64_is_a_uuid_unless_a_known_node_begins_with_it(home: Path) -> N
     assert {node["uuid"]: node["name"] for node in named} == {"fffe00124b0014b5d999": None, known: "first"}
     unknown = call(home, "--json", "whitelist", "add", "nobody")
     assert (unknown.code, "nobody" in unknown.json["error"]["message"]) == (3, True)
+
+
+def test_what_another_command_adds_meanwhile_is_not_written_over(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan is made again under the lock: the other one may have pinned another key."""
+    lock = Station.lock
+    others: list[list[str]] = []
+
+    def after_another(station: Station, command: str, *of: Any, **more: Any) -> Any:
+        if others:
+            call(home, *others.pop())
+        return lock(station, command, *of, **more)
+
+    monkeypatch.setattr(Station, "lock", after_another)
+    others.append(["whitelist", "add", ONE, "--fingerprint", OTHER])
+    refused = call(home, "--json", "whitelist", "add", ONE, "--fingerprint", KEY)
+    assert (refused.code, refused.json["error"]["code"]) == (6, "other-key")
+    (entry,) = call(home, "--json", "whitelist", "list").json["whitelist"]
+    assert entry["fingerprint"] == OTHER
+    others.append(["whitelist", "add", TWO, "--fingerprint", KEY, "--name", "palm"])
+    same = call(home, "--json", "whitelist", "add", TWO, "--fingerprint", KEY, "--name", "palm").json
+    assert (same["added"], same["changed"], same["unchanged"]) == (0, 0, 1)

@@ -345,7 +345,7 @@ def test_a_blocked_adapter_says_by_what(system: System) -> None:
 @pytest.mark.parametrize(
     ("text", "numbers"),
     [("1.2.3", (1, 2, 3)), ("8.4.2rc1", (8, 4, 2)), ("2026.1", (2026, 1)), ("1.2.dev3", (1, 2)), ("1.2+x", (1, 2)),
-     ("v1", ()), ("1..2", (1,))],
+     ("v1", ()), ("1..2", (1,)), ("1.2rc4.5", (1, 2)), ("2.0.dev3.1", (2, 0)), ("1.2+local.7", (1, 2))],
 )  # fmt: skip
 def test_a_version_is_its_leading_numbers(text: str, numbers: tuple[int, ...]) -> None:
     assert machine._numbers(text) == numbers
