@@ -650,7 +650,7 @@ def of_data_message(key: bytes, run: int, counter: int, message: bytes) -> Slip 
         run_label_without_00=(run_key(label[:-1]), 'the label "TEDS1 stream" of the run\'s key lacks its 00'),
         run_drive_label=(run_key(b"TEDS1 drive\0"), "the key of the stream is made with the label of Drive"),
         run_little_endian=(run_key(label, run.to_bytes(2, "little")), "run is little-endian in the run's key"),
-        run_before=(run_key(label, (run - 1).to_bytes(2, "big")), "the run's key is that of the run before"),
+        run_before=(run_key(label, (run - 1 & 0xFFFF).to_bytes(2, "big")), "the run's key is that of the run before"),
         run_left_out=(run_key(label, b""), "the run's key leaves out run"),
         run_key_is_km=(key[:16], "messages are sealed under k_m; each run has its own key"),
     )
@@ -659,7 +659,10 @@ def of_data_message(key: bytes, run: int, counter: int, message: bytes) -> Slip 
         nonce_counter_first=(head + bytes(9), SEALED[1][0].words),
         nonce_counter_little_endian=(bytes(9) + head[::-1], SEALED[2][0].words),
         nonce_of_zeros=(bytes(13), "the nonce of a data message is zeros alone: one key and nonce for many messages"),
-        nonce_next_counter=(bytes(9) + (counter + 1).to_bytes(4, "big"), "the counter in the nonce is one too high"),
+        nonce_next_counter=(
+            bytes(9) + (counter + 1 & 0xFFFFFFFF).to_bytes(4, "big"),
+            "the counter in the nonce is one too high",
+        ),
     )
     for (named, under), (slip, nonce) in product(keys, nonces):
         for aad in (None, head):

@@ -155,6 +155,7 @@ def write_drops(probe: Probe) -> str:
     probe.sealed_refused(update_teds(*block), Reason.BAD_FORM, "its end was dropped")
     most = TedsStatus.decode(probe.good(query_teds(*block))).max_size
     if most > _MOST_WRITTEN:
+        probe.close()
         return f"MaxTEDSSize {most} was not tried"
     room = probe.max_message - _HEAD
     for offset in range(0, most, room):

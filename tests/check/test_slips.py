@@ -439,3 +439,24 @@ def test_the_counter_after_the_last_is_0() -> None:
     """c of Open has 64 bits; a node that counts too early has the next one in its mac."""
     found = [slips._next(bytes.fromhex(text)).hex() for text in ("00" * 8, "7f" + "ff" * 7, "ff" * 8)]
     assert found == ["00" * 7 + "01", "80" + "00" * 7, "00" * 8]
+
+
+def test_a_number_at_either_end_of_its_range_is_tried_as_any_other() -> None:
+    """The number before 0 and the one after the last do not fit: what a faulty board sends never ends the check."""
+    for epoch in (b"\0\0\0\0", b"\xff\xff\xff\xff"):
+        made = Agreement(REQUEST, NONCE + epoch + EN + bytes(80), UUID, P, TEDS, ONE_TIME, STATION)
+        assert (made.slip_of_tag(), made.slip_of_signature()) == (None, None)
+        reset = b"TEDS1 reset\0" + UUID + epoch + CHALLENGE
+        wrong = b"TEDS1 reset" + UUID + epoch + CHALLENGE
+        number = int.from_bytes(epoch, "big")
+        assert slips.of_reset(UUID, P, number, CHALLENGE, NODE.sign(reset)) is None
+        assert name(slips.of_reset(UUID, P, number, CHALLENGE, NODE.sign(wrong))) == "label-without-00"
+    last, key = b"\xff\xff\xff\xff", bytes(range(32))
+    for run, before in ((0, b"\xff\xff"), (0xFFFF, b"\xff\xfe")):
+        made_so = expand(key, b"TEDS1 stream\0" + before, 16)
+        octets = last + ccm(made_so, ZEROS + last, b"sample", tag=8)
+        assert name(slips.of_data_message(key, run, 0xFFFFFFFF, octets)) == "run-before"
+    after = ccm(expand(key, b"TEDS1 stream\0" + b"\0\1", 16), bytes(13), b"sample", tag=8)
+    found = name(slips.of_data_message(key, 1, 0xFFFFFFFF, last + after))
+    assert found in ("nonce-of-zeros", "nonce-next-counter"), "0 comes after the last counter"
+    assert slips.of_sealed_reply(KEYS, last + bytes(36), 0xFFFFFFFF) is None

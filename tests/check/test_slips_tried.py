@@ -1,0 +1,394 @@
+"""Slips that are tried on the board, one request each; and the ends of a check at which nothing explains a fault."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.ciphers.aead import AESCCM
+
+from teds_provision.check import agreement_rules, measuring_rules, plain_rules, write_rules
+from teds_provision.check.agreement_rules import StrangerStation
+from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError
+from teds_provision.check.run import _Run
+from teds_provision.check.slips import Slip
+from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, verify
+from teds_provision.protocol.messages.frames import Command, Reply, TedsStatus
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.teds.sheet import ChannelKind
+
+from . import bends
+
+UUID, KEY, OKM = bytes(range(10)), bytes(range(16)), bytes(range(48))
+NODE = SoftwareKey.generate()
+
+
+def _refusal(reason: int) -> Reply:
+    return Reply(False, bytes([reason]))
+
+
+def _name(slip: Slip | None) -> str | None:
+    return slip.name if slip is not None else None
+
+
+# -- Open and Sealed ---------------------------------------------------------------------------------------------------
+
+
+def _key_id(label: bytes = b"TEDS1 key id\0") -> bytes:
+    return bends.sha(label + KEY)[:8]
+
+
+def _mac(counter: bytes, point: bytes, label: bytes = b"station open") -> bytes:
+    return bends.mac(KEY, label + UUID + counter + point)[:16]
+
+
+@pytest.mark.parametrize(
+    ("reason", "key_id", "label", "slip"),
+    [
+        (16, _key_id(b"TEDS1 key id"), b"station open", "key-id-label-without-00"),
+        (12, _key_id(), b"", "mac-without-label"),
+        (12, _key_id(), b"station open", None),  # it takes a right Open now
+        (16, None, b"station open", None),  # it takes any keyId
+        (12, _key_id(), None, None),  # it takes any mac
+        (12, _key_id(), b"any but the right one", None),
+        (16, _key_id(), b"any but the right one", None),
+        (12, b"", b"", None),  # it takes nothing
+        (17, _key_id(), b"", None),  # another refusal: nothing is tried
+    ],
+)
+def test_a_refused_open_is_explained_by_what_the_node_takes(
+    reason: int, key_id: bytes | None, label: bytes | None, slip: str | None
+) -> None:
+    """profile.md, "Sessions": 16 is an unknown keyId, 12 a wrong mac; c is fetched anew for each try."""
+    counters: list[bytes] = []
+
+    def counter() -> bytes:
+        counters.append(len(counters).to_bytes(8, "big"))
+        return counters[-1]
+
+    def plain(command: Command) -> Reply:
+        known, point, mac = command.payload[:8], command.payload[8:73], command.payload[73:]
+        if label == b"any but the right one":
+            return _refusal(12) if (known, mac) == (key_id, _mac(counters[-1], point)) else Reply(True, b"")
+        good = (key_id is None or known == key_id) and (label is None or mac == _mac(counters[-1], point, label))
+        return Reply(True, b"") if good else _refusal(16)
+
+    rig: Any = SimpleNamespace(link_key=KEY, uuid=UUID, okm=OKM, plain=plain, opening_counter=counter)
+    assert _name(Probe._slip_of_open(rig, _refusal(reason), SoftwareKey.generate())) == slip
+    assert (counters == []) == (reason == 17)
+
+
+@pytest.mark.parametrize(
+    ("takes", "slip"),
+    [
+        ("little", "nonce-counter-little-endian"),
+        ("right", None),
+        ("anything", None),
+        ("nothing", None),
+        ("wrong", None),
+    ],
+)
+def test_a_sealed_frame_with_a_wrong_tag_is_explained_by_what_the_node_takes(takes: str, slip: str | None) -> None:
+    key, identify = bytes(range(16)), bytes.fromhex("000080070000")
+    asked: list[bytes] = []
+
+    def sealed(payload: bytes) -> bytes:
+        counter = payload[:4]
+        nonce = bytes(9) + (counter[::-1] if takes == "little" else counter)
+        padded = identify + b"\x0a" * 10
+        return counter + AESCCM(key, 16).encrypt(nonce, padded, b"")
+
+    def plain(command: Command) -> Reply:
+        asked.append(command.payload)
+        if takes in ("nothing", "wrong"):
+            good = takes == "wrong" and command.payload != sealed(command.payload)
+            return Reply(True, b"") if good else _refusal(12)
+        return Reply(True, b"") if takes == "anything" or command.payload == sealed(command.payload) else _refusal(12)
+
+    def seal(_command: Command, *, counter: int) -> Any:
+        number = counter.to_bytes(4, "big")
+        sealed_frame = AESCCM(key, 16).encrypt(bytes(9) + number, identify + b"\x0a" * 10, b"")
+        return SimpleNamespace(payload=number + sealed_frame)
+
+    session: Any = SimpleNamespace(seal=seal, keys=SimpleNamespace(to_node=key, to_station=key[::-1]))
+    rig: Any = SimpleNamespace(plain=plain)
+    assert _name(Probe._slip_of_sealed(rig, session)) == slip
+    counters = [int.from_bytes(payload[:4], "big") for payload in asked]
+    assert counters[0] == 1000, "far beyond what the session has used"
+    assert counters[2:] == list(range(1001, 1001 + len(counters[2:]))), "another one for each try"
+
+
+# -- the key agreement -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("state", "takes", "slip"),
+    [
+        (NodeState.FACTORY, b"", "station-without-label"),
+        (NodeState.FACTORY, b"TEDS1 station key", "station-label-without-00"),
+        (NodeState.FACTORY, b"TEDS1 station key\0", None),  # it takes a good Request now
+        (NodeState.FACTORY, None, None),  # it takes any
+        (NodeState.FACTORY, b"unknown", None),
+        (NodeState.FACTORY, b"any but the right one", None),
+        (NodeState.KEYED, b"", None),  # strangers are refused there, whatever they send
+    ],
+)
+def test_a_refused_sig104_is_explained_by_what_the_node_verifies(
+    state: NodeState, takes: bytes | None, slip: str | None
+) -> None:
+    asked: list[Command] = []
+
+    def plain(command: Command) -> Reply:
+        asked.append(command)
+        station, signature, ca = command.payload[:65], command.payload[65:129], command.payload[129:194]
+        if takes == b"any but the right one":
+            good = not verify(ca, b"TEDS1 station key\0" + station, signature)
+        else:
+            good = takes is None or verify(ca, takes + station, signature)
+        return Reply(True, b"") if good else _refusal(5)
+
+    rig: Any = SimpleNamespace(identity=lambda: Identity(UUID, state, 1, 0, 512, 17), plain=plain)
+    assert _name(agreement_rules._slip_of_request(rig)) == slip
+    assert bool(asked) == (state == NodeState.FACTORY)
+
+
+@pytest.mark.parametrize(("reason", "tried"), [(5, 1), (3, 0)])
+@pytest.mark.parametrize("sealed", [False, True])
+def test_only_a_refused_signature_of_a_request_is_looked_into(
+    monkeypatch: pytest.MonkeyPatch, reason: int, tried: int, sealed: bool
+) -> None:
+    slip, looked, asked = Slip("a-slip", "what it did"), list[Any](), list[str]()
+
+    def slip_of(probe: Any) -> Slip:
+        looked.append(probe)
+        return slip
+
+    monkeypatch.setattr(agreement_rules, "_slip_of_request", slip_of)
+
+    def answer(kind: str) -> Any:
+        def answered(_command: Command) -> Reply:
+            asked.append(kind)
+            return _refusal(reason)
+
+        return answered
+
+    probe: Any = SimpleNamespace(uuid=UUID, teds=lambda _: b"", plain=answer("plain"), sealed=answer("sealed"))
+    with pytest.raises(RuleBrokenError) as broken:
+        agreement_rules.try_agreement(probe, StrangerStation.make().credentials, sealed=sealed)
+    assert str(broken.value).startswith(f"Request (128.1), 259 octets: success is due, refusal {reason} came.")
+    assert (broken.value.slip, looked) == ((slip, [probe]) if tried else (None, []))
+    assert asked == ["sealed" if sealed else "plain"]
+
+
+@pytest.mark.parametrize(
+    ("takes", "slip", "keyed"),
+    [("right", None, True), ("zeros", None, True), ("mac-reversed", "mac-reversed", True), ("nothing", None, False)],
+)
+def test_a_refused_tag_is_explained_by_the_one_that_the_node_takes(
+    monkeypatch: pytest.MonkeyPatch, takes: str, slip: str | None, keyed: bool
+) -> None:
+    """Each is tried with a Request of its own, whose key is kept before the node can have it."""
+    script, right = bytes(range(32)), bytes(range(100, 116))
+    agreed: Any = SimpleNamespace(key=KEY, confirm=Command(0, 128, 2, right))
+    tried: Any = SimpleNamespace(okm=OKM, script=script)
+    monkeypatch.setattr(agreement_rules, "agree", lambda _probe: (agreed, tried))
+    reverse = bends.mac(OKM[16:], b"station" + script)[:16][::-1]
+    due = {"right": right, "zeros": bytes(16), "mac-reversed": reverse, "nothing": None}[takes]
+    kept, asked = list[Any](), list[bytes]()
+
+    def plain(command: Command) -> Reply:
+        asked.append(command.payload)
+        assert len(kept) == len(asked)
+        return Reply(True, b"") if command.payload == due else _refusal(12)
+
+    probe: Any = SimpleNamespace(keep=kept.append, plain=plain, key=None, okm=b"")
+    assert _name(agreement_rules._slip_of_confirm(probe)) == slip
+    assert (probe.key, probe.okm) == ((KEY, OKM) if keyed else (None, b""))
+    assert asked[:2] == [right, bytes(16)][: len(asked)]
+    assert len(asked) == len(set(asked))
+    assert takes != "nothing" or len(asked) == 8, "the right one, zeros, and six slips"
+
+
+@pytest.mark.parametrize(
+    ("reply", "words"),
+    [(Reply(True, b""), "success, 0 octets came."), (_refusal(2), "refusal 2 came."), (_refusal(12), "")],
+)
+@pytest.mark.parametrize(("state", "tapped", "way"), [
+    (NodeState.FACTORY, True, "plain"), (NodeState.KEYED, True, "plain"), (NodeState.KEYED, False, "sealed"),
+])  # fmt: skip
+def test_a_test_agreement_is_ended_on_the_node(
+    monkeypatch: pytest.MonkeyPatch, reply: Reply, words: str, state: NodeState, tapped: bool, way: str
+) -> None:
+    """A Confirm of zeros gets 12 and ends it; in a session over CAN, as the node's owner asks there."""
+    asked, closed = list[tuple[str, str]](), list[int]()
+    made = SimpleNamespace(request=b"rq", reply=b"rp", teds=b"te", tags=lambda okm, _: iter([(None, okm[16:32])]))
+    tried = SimpleNamespace(agreement=made, broken=None, script=b"s" * 32, okm=OKM)
+    how: list[Any] = []
+
+    def request(_probe: Any, credentials: Any, *, sealed: bool) -> Any:
+        how.append((credentials == "own", sealed))
+        return tried
+
+    def answer(kind: str) -> Any:
+        def answered(command: Command) -> Reply:
+            asked.append((kind, command.payload.hex()))
+            return reply
+
+        return answered
+
+    monkeypatch.setattr(agreement_rules, "try_agreement", request)
+    probe: Any = SimpleNamespace(
+        identity=lambda: Identity(UUID, state, 1, 0, 512, 17), tapped=tapped, station="own",
+        plain=answer("plain"), sealed=answer("sealed"), close=lambda: closed.append(1),
+    )  # fmt: skip
+    if words:
+        with pytest.raises(RuleBrokenError) as broken:
+            agreement_rules.explain(probe)
+        assert str(broken.value) == f"Confirm (128.2) with a wrong tagS, to end the test: refusal 12 is due, {words}"
+    else:
+        explained = agreement_rules.explain(probe)
+        assert (explained.problem, explained.slip, explained.station_tag) == (
+            "", None, bends.mac(OKM[16:], b"station" + b"s" * 32)[:16]
+        )  # fmt: skip
+        assert explained.tag_due == OKM[16:32]
+    assert asked == [(way, "00" * 16)]
+    assert how == [(state == NodeState.KEYED, way == "sealed")]
+    assert closed == [] if words else closed == [1]
+
+
+# -- a proof, and rules that find nothing to try -----------------------------------------------------------------------
+
+
+def _high(signature: bytes) -> bytes:
+    return signature[:32] + (GROUP_ORDER - int.from_bytes(signature[32:], "big")).to_bytes(32, "big")
+
+
+@pytest.mark.parametrize(
+    ("label", "change", "found"),
+    [
+        (b"TEDS1 prove\0", bytes, "64 octets, good under field 101"),
+        (b"TEDS1 prove\0", _high, "64 octets, good under field 101"),  # the rule prove-low-s looks at s
+        (b"TEDS1 prove", bytes, "label-without-00"),
+        (b"TEDS1 prove\0", lambda proof: proof[:-1], None),
+    ],
+)
+def test_a_proof_counts_with_either_s(label: bytes, change: Any, found: str | None) -> None:
+    def good(command: Command) -> bytes:
+        return bytes(change(NODE.sign(label + UUID + command.payload)))
+
+    probe: Any = SimpleNamespace(uuid=UUID, good=good, security=lambda: SimpleNamespace(node_key=NODE.point))
+    if found is not None and found.startswith("64"):
+        assert plain_rules.prove(probe) == found
+        return
+    with pytest.raises(RuleBrokenError) as broken:
+        plain_rules.prove(probe)
+    assert _name(broken.value.slip) == found
+    assert found is not None or str(broken.value).startswith("Prove (128.8): 64 octets are due, 63 came.")
+
+
+def test_a_fault_of_the_channels_is_reported_once_and_then_skips_their_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> Any:
+        raise RuleBrokenError("Operate (4.1): torn")
+
+    monkeypatch.setattr(measuring_rules, "_operation", lambda _: SimpleNamespace(channels={}))
+    monkeypatch.setattr(measuring_rules, "_fitting", broken)
+    probe: Any = SimpleNamespace(channels={}, no_channels="", keep=None, sealed=lambda _: _refusal(3))
+    with pytest.raises(RuleBrokenError, match=r"Operate \(4.1\): torn"):
+        measuring_rules.channels(probe)
+    with pytest.raises(NotApplicableError) as no:
+        measuring_rules.channels(probe)
+    assert str(no.value) == "No channel can be claimed: Operate (4.1): torn"
+
+    probe.no_channels = ""
+    monkeypatch.setattr(measuring_rules, "_operation", lambda _: SimpleNamespace(channels={1: (0, 0), 2: (0, 0)}))
+    monkeypatch.setattr(measuring_rules, "_fitting", lambda *_: {})
+    for _ in range(2):
+        with pytest.raises(NotApplicableError) as no:
+            measuring_rules.channels(probe)
+        assert str(no.value) == (
+            "No Channel TEDS fits any of its 2 channels. Provision the board with its datasheet, or let the check write"
+            " one: --factory"
+        )
+    assert measuring_rules._octets(b"\0\0\0\4no TEDS") == 0
+
+
+@pytest.mark.parametrize(("slow", "found"), [((), 1), ((1,), 4), ((1, 4), 12), ((1, 4, 12), None)])
+def test_a_lease_shorter_than_an_exchange_is_tried_longer(
+    monkeypatch: pytest.MonkeyPatch, slow: tuple[int, ...], found: int | None
+) -> None:
+    """A claim that ran out before Operation was asked accuses no node."""
+    now, pauses, lease_now = [0.0], list[float](), [0]
+
+    def claimed(_probe: Any, channel: int, *, lease: int) -> Any:
+        assert channel == 3
+        lease_now[0] = lease
+        return nullcontext()
+
+    def operation(_probe: Any) -> Any:
+        late = lease_now[0] in slow
+        now[0] += lease_now[0] if late else 0
+        here = not late and len(pauses) == 0
+        return SimpleNamespace(channels={3: (2 if here else 0, 0)}, measuring=False)
+
+    monkeypatch.setattr(measuring_rules, "_sensor", lambda _: 3)
+    monkeypatch.setattr(measuring_rules, "_claimed", claimed)
+    monkeypatch.setattr(measuring_rules, "_operation", operation)
+    probe: Any = SimpleNamespace(now=lambda: now[0], pause=pauses.append)
+    if found is None:
+        with pytest.raises(NotApplicableError) as no:
+            measuring_rules.operate_expires(probe)
+        assert str(no.value) == "An exchange took longer than 12 s."
+        return
+    assert measuring_rules.operate_expires(probe) == f"a lease of {found} s ends the claim"
+    assert pauses == [pytest.approx(found + 0.4)]
+
+
+def test_the_size_of_a_large_teds_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above 32 KiB it would take minutes; what was staged goes all the same."""
+    closed, written = list[int](), list[int]()
+    status = TedsStatus(0, 0, 0, 32769)
+    monkeypatch.setattr(write_rules, "absent", lambda _: (255, 17))
+    probe: Any = SimpleNamespace(
+        sealed_good=lambda command: written.append(command.function), sealed_refused=lambda *_: "refused",
+        good=lambda _: status.encode(), close=lambda: closed.append(1), max_message=512,
+    )  # fmt: skip
+    assert write_rules.write_drops(probe) == "MaxTEDSSize 32769 was not tried"
+    assert (written, closed) == ([3, 3], [1])
+
+
+# -- the run -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("knows", "found"), [(b"1" * 16, 0), (b"3" * 16, 2), (b"9" * 16, None)])
+def test_a_node_that_opens_no_session_still_shows_which_key_it_knows(knows: bytes, found: int | None) -> None:
+    """It answers a wrong mac with 12 under a keyId that it knows, else with 16."""
+    keys = [SimpleNamespace(key=letter * 16) for letter in (b"1", b"2", b"3")]
+    known = bends.sha(b"TEDS1 key id\0" + knows)[:8]
+    rig: Any = SimpleNamespace(
+        _node=SimpleNamespace(uuid=UUID),
+        _station=SimpleNamespace(keys=SimpleNamespace(unwrapped=lambda _uuid: keys)),
+        _probe=SimpleNamespace(plain=lambda command: _refusal(12 if command.payload[:8] == known else 16)),
+    )
+    held: Any = _Run._known_there(rig)
+    assert held is (keys[found] if found is not None else None)
+
+
+@pytest.mark.parametrize("error", [RuleBrokenError("tagN is wrong."), NotApplicableError("Needs NFC.")])
+def test_why_nothing_is_explained_is_kept(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def explain(_probe: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr("teds_provision.check.run.explain", explain)
+    rig: Any = SimpleNamespace(_explaining=True, _probe=None, _explained=None)
+    _Run._explain(rig)
+    assert rig._explained == str(error)
+    rig = SimpleNamespace(_explaining=False, _probe=None, _explained=None)
+    _Run._explain(rig)
+    assert rig._explained is None
+
+
+def test_a_channel_of_an_unknown_form_has_no_octets() -> None:
+    teds = measuring_rules.channel_teds(ChannelKind.SENSOR, 1, 2)
+    assert measuring_rules._octets(teds) == 2
