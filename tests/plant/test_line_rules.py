@@ -140,7 +140,10 @@ def test_a_job_that_ended_since_the_run_began_takes_no_further_board(
 
 def test_a_job_that_is_closed_is_told_and_takes_nothing(owner: Station) -> None:
     made = job(owner)
-    close_job(owner, made)
+    for _ in range(2):
+        close_job(owner, made)
+    closed = [entry for entry in owner.audit_log.entries() if entry.act == "job"]
+    assert [(entry.uuid, entry.outcome, entry.detail) for entry in closed] == [(None, "closed", {"job": made.id})]
     [(_, _, text)] = owner.plant.outbox(9)
     told = json.loads(text)
     assert (told["act"], told["job"]) == ("closed", made.id)
@@ -275,6 +278,10 @@ def test_evidence_is_kept_whole_and_told_with_its_digest_and_what_failed(owner: 
         EvidenceRow(digest, A, run.job.id, 1, 1, "failed", "2026-03-01T12:00:00Z", b"first")
     ]
     assert (line.count_units(run.job.id), run.passed, run.total) == ((1, 0, 1), 0, 3)
+    assert [(entry.act, entry.uuid, entry.outcome, entry.detail) for entry in owner.audit_log.entries()][-2:] == [
+        ("unit", A, "taken", {"job": run.job.id, "unit": 1, "attempt": 1}),
+        ("evidence", A, "failed", {"sha256": digest, "attempt": 1}),
+    ]
     assert kept(run, allotted(run), None, b"second")["verdict"] == "passed"
     kept(run, allotted(run), None, b"third")
     assert line.unit(run.job.id, A) == UnitRow(run.job.id, A, 1, line.unit(run.job.id, A).at, 3, 2)  # type: ignore[union-attr]

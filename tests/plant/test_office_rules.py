@@ -60,6 +60,12 @@ def test_a_request_is_judged_in_the_order_of_the_contract(desk: Desk) -> None:
     def refused(request: SignRequest, **more: Any) -> tuple[str, str]:
         reply = desk.asks(request, **more)
         assert reply.security == b""
+        if reply.refused != "not-line":
+            entry = list(north.audit_log.entries())[-1]
+            assert (entry.act, entry.uuid, entry.outcome, entry.detail) == (
+                "sign-request", board.uuid, reply.refused,
+                {"by": desk.line.fingerprint, "job": request.job, "why": reply.why},
+            )  # fmt: skip
         return reply.refused, reply.why
 
     assert refused(bad, by=base)[0] == "not-line"
@@ -103,6 +109,10 @@ def test_a_signature_is_durable_with_its_pin_unit_sequence_and_event(desk: Desk)
         board.uuid.hex(), 1, request.job, 1
     )  # fmt: skip
     assert reply.sequence == 1
+    entry = list(north.audit_log.entries())[-1]
+    assert (entry.act, entry.uuid, entry.outcome, entry.detail) == (
+        "sign-request", board.uuid, "signed", {"by": desk.line.fingerprint, "job": request.job, "unit": 1}
+    )  # fmt: skip
 
 
 def test_the_same_request_gets_the_stored_answer_whatever_happened_since(desk: Desk) -> None:

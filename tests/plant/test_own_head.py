@@ -286,7 +286,9 @@ def test_a_decision_makes_another_home_of_it_that_has_nothing_acknowledged(west:
     home, joined = west.station.plant.home, west.station.plant.joined
     assert joined is not None
     assert joined.acknowledged == 1
-    resume(west.station, Registry(west.stick))
+    assert resume(west.station, Registry(west.stick)) == 1
+    entry = list(west.station.audit_log.entries())[-1]
+    assert (entry.act, entry.outcome, entry.detail) == ("registry", "resumed", {"adopted": 1})
     joined = west.station.plant.joined
     assert joined is not None
     assert joined.acknowledged == 0

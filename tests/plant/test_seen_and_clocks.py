@@ -32,6 +32,8 @@ def test_a_report_of_pages_that_are_missing_is_shown_until_a_person_has_seen_it(
     assert message in made.sync(south).remarks
     assert message in made.sync(south).remarks
     assert acknowledge(south) == (0, 1)
+    entry = list(south.audit_log.entries())[-1]
+    assert (entry.act, entry.outcome, entry.detail) == ("registry", "seen", {"alarms": 0, "heads": 1})
     assert made.sync(south).remarks == []
     assert acknowledge(south) == (0, 0)
     report(10_001)
@@ -47,6 +49,7 @@ def test_an_alarm_that_was_seen_is_raised_again_by_one_more_occurrence_and_not_b
     for again, left in ((False, []), (True, ["later"])):
         alarm(made.north, "junk", about, 3, "first", again=again)
         assert acknowledge(made.north) == (1, 0)
+        assert list(made.north.audit_log.entries())[-1].detail == {"alarms": 1, "heads": 0}
         alarm(made.north, "junk", about, 3, "later", again=again)
         assert [raised.why for raised in made.north.plant.alarms.all() if not raised.seen] == left
         made.north.plant.alarms.end_about("junk", about)

@@ -80,6 +80,10 @@ def behind_its_back(home: Path, *statements: str) -> None:
 def test_an_untouched_store_says_nothing(opened: Open) -> None:
     messages: list[str] = []
     station = opened(messages)
+    first = next(station.audit_log.entries())
+    assert (first.act, first.outcome, first.detail) == (
+        "init", "done", {"fingerprint": station.fingerprint, "keystore": "file"}
+    )  # fmt: skip
     station.unlock()
     assert messages == []
     assert list(station.row_macs.all_broken()) == []

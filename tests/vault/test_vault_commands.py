@@ -215,7 +215,9 @@ def test_a_new_passphrase_by_command(home: Path) -> None:
     assert spawn("--home", home, "vault", "rewrap", passphrase=NEW).code == 0
     station = opened(home, NEW)
     assert len(keys(station)) == 5
-    assert [entry.outcome for entry in station.audit_log.entries()][-2:] == ["new passphrase", "rewrapped"]
+    *_, changed, rewrapped = station.audit_log.entries()
+    assert changed.outcome == "new passphrase"
+    assert (rewrapped.act, rewrapped.outcome, rewrapped.detail) == ("vault", "rewrapped", {"keys": 5, "damaged": 0})
     station.close()
 
 
