@@ -264,7 +264,7 @@ def compose(
     record = station.nodes.get(uuid)
     kept = order.name or name or (record.name if as_known and record is not None else None)
     made, digest = _built_of(profile, uuid, calibrations, kept, edition), digest_of(profile)
-    before = record.profile_digest if record is not None and record.profile == wanted else None
+    before = record.profile_digest if record is not None else None
     changed = order.profile is None and before is not None and before != digest
     if changed:
         warnings += (f"Profile {wanted} has changed since this node's datasheet was built.",)

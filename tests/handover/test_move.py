@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, UsageError
+from teds_provision.files import new_file
 from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
@@ -45,11 +49,18 @@ def test_what_is_there_before_the_key_is_stored_cannot_be_opened(pair: Pair, mon
         left.append(draft.read_bytes())
         raise KeyboardInterrupt
 
+    @contextmanager
+    def unbuffered(path: Path) -> Iterator[SimpleNamespace]:
+        with new_file(path) as file:
+            yield SimpleNamespace(write=lambda octets: (file.write(octets), file.flush()))
+
     with monkeypatch.context() as patch:
         patch.setattr("teds_provision.handover.outgoing._record", dying)
+        patch.setattr("teds_provision.handover.outgoing.new_file", unbuffered)
         with pytest.raises(KeyboardInterrupt):
             pair.export("move")
     assert not pair.north.policy.tombstones()
+    assert b'"ciphertext"' in left[0]
     assert b'"tag"' not in left[0]
     for closed in (left[0], left[0] + b'"}', left[0] + b'","tag":"AAAAAAAAAAAAAAAAAAAAAA"}'):
         with pytest.raises((BadDataError, NotAuthenticError)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from teds_provision.errors import BadDataError
+from teds_provision.handover.gc_pause import pause_gc
 from teds_provision.handover.incoming import ImportedRows, PlannedNode, _is_known_ca, _Judge, proven_of
 from teds_provision.protocol.handover.bundle import BundledNode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
@@ -102,6 +105,17 @@ def test_a_node_that_comes_back_is_rotated_and_its_tombstone_goes(station: Stati
     assert (station.keys.rotation_due(A) or "").startswith(word)
     assert (station.keys.rotation_due(B) is not None) is (mode == "move")
     assert station.policy.tombstones() == []
+
+
+def test_a_node_gets_a_pin_if_it_has_none_whether_it_is_known_or_not(station: Station) -> None:
+    station.nodes.put(NodeRecord(A))
+    station.pins.put(WhitelistEntry(B, PIN, assurance="tap", name="own name"))
+    take(station, *(PlannedNode(node(uuid), "new", name="thumb") for uuid in (A, B)))
+    first, second = (station.pins.entry(uuid) for uuid in (A, B))
+    assert first is not None
+    assert second is not None
+    assert (first.fingerprint, first.assurance, first.name) == (PIN, "import", "thumb")
+    assert (second.fingerprint, second.assurance, second.name) == (PIN, "tap", "own name")
 
 
 def test_a_node_joins_the_groups_of_its_bundle_and_leaves_none(station: Station) -> None:
@@ -199,6 +213,23 @@ def test_which_ca_is_known_without_the_bundle(station: Station) -> None:
     assert [_is_known_ca(station, ca) for ca in keys] == [True, True, True, False]
     station.policy.end_ca(certified.point)
     assert not _is_known_ca(station, certified.point), "trust in it has ended"
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_rests_while_rows_are_made_and_is_then_as_it_was(enabled: bool) -> None:
+    def fails() -> None:
+        with pause_gc():
+            assert not gc.isenabled()
+            raise BadDataError("The bundle is damaged.")
+
+    try:
+        if not enabled:
+            gc.disable()
+        with pytest.raises(BadDataError):
+            fails()
+        assert gc.isenabled() is enabled
+    finally:
+        gc.enable()
 
 
 def test_who_is_proven(station: Station) -> None:

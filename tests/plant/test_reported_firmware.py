@@ -118,6 +118,8 @@ def test_a_board_that_went_back_is_reported_again_by_who_saw_that_firmware_befor
     look(south, board)
     plants.round()
     later()
+    keep_firmware(plants.north, board.uuid, FirmwareReading(OLD, sealed=False))
+    assert waiting(plants.north) == [], "anybody on the bus can send that"
     board.report = OLD  # by its debug connector
     for _ in range(3):
         look(plants.north, board)

@@ -116,6 +116,11 @@ def test_a_key_is_told_when_it_is_proven_and_again_when_it_is_rotated(station: S
     _activate(station, replace(pending_key, state="active"))
     _activate(station, replace(pending_key, source="import"))
     assert told(station) == [], "another station agreed it"
+    other = bytes(9) + b"\x01"
+    station.pins.put(WhitelistEntry(other, KEY[:32], assurance="uuid"))
+    station.keys.add_pending(other, key=bytes(16), key_id=bytes(8), epoch=1)
+    _activate(station, station.keys.keys_of(other)[0])
+    assert told(station) == [], "no whole fingerprint"
 
 
 def test_the_greatest_epoch_is_told_of_the_keys_that_are_left_no_more(station: Station) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from teds_provision.errors import GarbledError, NodeRefusedError, NodeSilentError, UsageError
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.provisioning import address
 from teds_provision.provisioning.address import set_address, set_address_at
@@ -74,6 +75,30 @@ def test_a_board_that_moves_at_once_and_loses_its_reply_is_found_at_the_new_addr
     record = station.nodes.get(board.uuid)
     assert record is not None
     assert record.can_address == 0x22
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_disturbed_reply_is_as_good_as_none(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, there: bool
+) -> None:
+    run(station, board)
+    with talk(board, OneBus(board, via="can", tapped=False)) as node:
+        send = node.request
+
+        def disturbed(command: Command, doing: str) -> bytes:
+            if there:
+                send(command, doing)
+            raise GarbledError("The reply was disturbed.")
+
+        monkeypatch.setattr(node, "request", disturbed)
+        if there:
+            assert set_address(station, node, 0x22)
+        else:
+            with pytest.raises(GarbledError, match="disturbed"):
+                set_address(station, node, 0x22)
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert (record.can_address == 0x22) is there
 
 
 def test_a_node_that_is_not_at_the_new_address_is_silent(station: Station, board: Board) -> None:

@@ -89,6 +89,18 @@ def keyed(station: Station, board: Board) -> None:
         agree(station, node, identify(station, node))
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_a_key_that_opens_after_a_lost_reply_is_the_one_that_this_run_agreed_on(
+    station: Station, board: Board, again: bool
+) -> None:
+    keyed(station, board)
+    word = agreeing._TakeoverConsent(rotate=False, take_over=None)
+    with talk(board) as node:
+        who = identify(station, node)
+        found = agreeing._agree(station, node, who, rotate=again, newcomer=None, word=word, again=again)
+    assert (found.epoch, found.fresh, found.listed) == (1, again, False), "not rotated once more"
+
+
 def test_what_a_plan_says(station: Station, board: Board) -> None:
     node = board.uuid.hex()
 

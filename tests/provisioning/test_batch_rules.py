@@ -38,7 +38,7 @@ from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import BuildOrder, compose, named_for
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.operator import Operator
-from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.progress import Reporter, SilentReporter, StepResult
 from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord, WhitelistEntry
@@ -804,6 +804,28 @@ def test_a_job_that_only_verifies_writes_nothing(station: Station, monkeypatch: 
     assert run._provision(node, Operator()) == (station, node, line, run._reporter)
     line.only_verify = False
     assert run._provision(node, Operator()) == "provisioned"
+
+
+def test_the_steps_of_one_of_several_boards_are_reported_under_its_name(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with station.transaction():
+        station.nodes.put(NodeRecord(uuid_of(1), name="hand"))
+        station.nodes.put(NodeRecord(uuid_of(2)))
+    run, steps = run_of(station, whole_bus=True), []
+
+    def provision(*_: object, reporter: Reporter, **__: object) -> Any:
+        reporter.finished(StepResult("write"))
+        return SimpleNamespace(image=Image(uuid_of(1), {(1, 5): b"x"}))
+
+    monkeypatch.setattr(run._reporter, "finished", steps.append)
+    monkeypatch.setattr(run, "_was_finished_elsewhere", lambda _node: False)
+    monkeypatch.setattr(batch, "provision", provision)
+    for number in (1, 2, 3):
+        assert run._board(answer(number), "can:test", Operator()) is not None
+    assert [step.of for step in steps] == ["hand", uuid_of(2).hex(), uuid_of(3).hex()]
+    run._provision(cast(Any, object()), Operator())
+    assert steps[-1].of == "", "of a board that is alone, the run's own"
 
 
 def test_a_row_is_done_already_if_the_board_has_what_the_row_gives(

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from teds_provision.errors import CalibrationMisfitError
+from teds_provision.errors import BadDataError, CalibrationMisfitError, NotAuthenticError
 from teds_provision.handover.life import plan_takeover, take_over
+from teds_provision.provisioning import datasheet_edit
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.provisioning.calibration_guard import guard
@@ -17,6 +20,7 @@ from teds_provision.provisioning.datasheet_edit import plan_sheet, write_sheet
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
+from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
@@ -146,6 +150,27 @@ def test_a_datasheet_by_document_keeps_a_draft_that_was_not_written(
         done = write_sheet(station, node, blocks, SilentReporter())
     assert any("draft drop" in warning for warning in done.plan.warnings)
     assert station.datasheets.draft(board.uuid) == draft
+
+
+def test_a_datasheet_by_document_that_cannot_be_written_or_is_not_authentic_in_the_end(
+    station: Station, board: Board, calibrated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = dict(station.datasheets.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
+    stranger = load_profile(ANGLE).build(bytes([7]) * 10).blocks
+    with talk(board) as node:
+        for place, octets, words in (
+            ((1, AccessCode.CHANNEL), blocks[1, AccessCode.CHANNEL][:-1] + b"\0", "TEDS 3 of channel 1 is damaged, or"),
+            ((0, AccessCode.META), stranger[0, AccessCode.META], f"belongs to node {'07' * 10}, not to"),
+        ):
+            with pytest.raises(BadDataError, match=words):
+                plan_sheet(station, node, {**blocks, place: octets})
+        altered = Verification(board.uuid, (Check("signature", "failed", "it was altered"),))
+        seen: list[Any] = []
+        judged = SimpleNamespace(verified=altered)
+        monkeypatch.setattr(datasheet_edit, "judge_and_keep", lambda *_, by: (seen.append(by), judged)[1])
+        with pytest.raises(NotAuthenticError, match="it was altered"):
+            write_sheet(station, node, blocks, SilentReporter())
+    assert seen == ["write"]
 
 
 def angle() -> tuple[Calibration, Channel]:

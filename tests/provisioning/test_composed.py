@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -118,6 +119,25 @@ def test_a_draft_is_pending_until_the_node_has_a_datasheet_as_new(
     monkeypatch.setattr(type(station.datasheets), "draft", lambda *_: Draft(UUID, image, stage, None))
     has = None if on_node is None else Image(UUID, {SECURITY: bytes([on_node])})
     assert pending_image(station, UUID, has) is (image if pending else None)
+
+
+@pytest.mark.parametrize("record", [True, False])
+def test_a_calibration_that_was_accepted_is_recorded_unless_it_is_a_dry_run(
+    station: Station, monkeypatch: pytest.MonkeyPatch, record: bool
+) -> None:
+    has, image = Image(UUID, {(0, 1): b"old"}), Image(UUID, {(0, 1): b"new"})
+    whole = Proposal(image, (), True, ("first",), "gripper", "hand", {}, "ab")
+    calibrated = replace(whole, calibrations={1: "calibration"})  # type: ignore[dict-item]
+    prepared: Any = SimpleNamespace(order=SimpleNamespace(accept_calibration="a reason"), profile="profile")
+    given: list[Any] = []
+    monkeypatch.setattr(step, "guard", lambda *words, **how: (given.append((words[1:], how)), ("guarded", "first"))[1])
+    monkeypatch.setattr(step, "topic_warnings", lambda *words: (str(words[1:] == (has, image)),))
+    for proposal, guarded in ((whole, (None, None)), (calibrated, ({1: "calibration"}, "profile"))):
+        monkeypatch.setattr(step, "_proposal", lambda *_, proposal=proposal: proposal)
+        found = step.propose(station, prepared, SimpleNamespace(image=has), record=record)  # type: ignore[arg-type]
+        assert given.pop() == ((image, has, "a reason", *guarded), {"record": record})
+        assert found == replace(proposal, changes=found.changes, warnings=("first", "guarded", "True"))
+        assert len(found.changes) == 1
 
 
 def test_only_a_change_that_was_not_named_needs_a_yes() -> None:

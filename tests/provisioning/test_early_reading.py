@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 
@@ -164,6 +166,40 @@ def test_what_was_answered_counts_once_for_a_minute_and_for_this_very_contact(
     assert reading().answers_of(replace(one, identity=replace(one.identity, state=NodeState.KEYED))) is None
     monkeypatch.setattr(early_reading, "_FRESH_SECONDS", 0.0)
     assert reading().answers_of(one) is None, "too long ago"
+
+
+def test_at_most_so_many_boards_are_read_at_once_and_none_waits_for_one_that_is_not_begun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    contacts = [at(number + 1, board) for number, board in enumerate(boards(4))]
+    begun: list[Contact] = []
+    goes_on = threading.Semaphore(0)
+
+    def ask(one: Contact) -> Any:
+        begun.append(one)
+        goes_on.acquire()
+        return one.address
+
+    def at_work() -> list[str]:
+        return [thread.name for thread in threading.enumerate() if thread.name.startswith("early ")]
+
+    monkeypatch.setattr(early_reading, "_ask", ask)
+    early = EarlyReading(at_once=1)
+    for one in contacts:
+        early.add(one)
+    assert at_work() == [f"early {contacts[0].identity.uuid.hex()}"]
+    goes_on.release()
+    until(lambda: begun == contacts[:2])
+    early.stop()
+    found: list[Any] = []
+    waits = threading.Thread(target=lambda: found.extend(map(early.answers_of, contacts[2:])), daemon=True)
+    waits.start()
+    until(lambda: not waits.is_alive())
+    goes_on.release()
+    found += map(early.answers_of, contacts[:2])
+    assert found == [None, None, 1, 2]
+    assert begun == contacts[:2]
+    until(lambda: at_work() == [])
 
 
 def test_a_board_that_has_a_key_is_not_read_early_nor_one_after_the_end() -> None:

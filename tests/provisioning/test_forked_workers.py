@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import pickle
 import selectors
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 
 from teds_provision.errors import BadDataError, TedsProvisionError
+from teds_provision.provisioning import forked_workers
 from teds_provision.provisioning.forked_workers import map_ranges
 from tests.cli.shell import ROOT, clean_environment
 from tests.pace import PATIENCE
@@ -37,6 +41,50 @@ def test_results_come_in_the_order_of_the_ranges_even_if_the_first_is_the_last_t
     assert len(pids) == 2
     os.close(read)
     os.close(write)
+
+
+def test_no_more_than_eight_ranges_for_each_worker_are_ahead_of_the_first_that_is_not_ready(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their results wait in the parent: a slow first file must not let those of 100,000 others fill its memory."""
+    lines = socket.socketpair()
+    slow, quick = (forked_workers._Worker(0, line) for line in lines)
+    handed: list[int] = []
+    looks: list[int] = []
+
+    class Selector:
+        def __enter__(self) -> Selector:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            """Nothing is open."""
+
+        def register(self, *_: object) -> None:
+            """All are looked at."""
+
+        def select(self) -> list[tuple[SimpleNamespace, int]]:
+            looks.append(len(handed))
+            return [(SimpleNamespace(data=worker), 0) for worker in (slow, quick)]
+
+    def hand(worker: forked_workers._Worker, place: int, places: range) -> None:
+        worker.places.append(place)
+        handed.append(places.start)
+
+    def receive(worker: forked_workers._Worker, results: dict[int, tuple[bool, bytes]]) -> None:
+        if worker is quick or looks[-2:] == [looks[-1]] * 2:
+            while worker.places:
+                results[worker.places.popleft()] = (True, pickle.dumps("done"))
+
+    monkeypatch.setattr(selectors, "DefaultSelector", Selector)
+    monkeypatch.setattr(forked_workers, "_hand", hand)
+    monkeypatch.setattr(forked_workers, "_receive", receive)
+    found = forked_workers._collect([slow, quick], [range(at, at + 1) for at in range(40)])
+    assert next(found) == "done"
+    assert handed == list(range(16)), "until the first is ready"
+    assert len(list(found)) == 39
+    assert handed == list(range(40))
+    for line in lines:
+        line.close()
 
 
 def test_a_result_of_megabytes_comes_whole() -> None:

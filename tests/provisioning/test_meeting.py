@@ -413,6 +413,10 @@ def test_a_reader_that_is_missing_is_named_with_where_the_node_was_last(
         "Give its link: --can socketcan:can0, --ble hci0 or --nfc usb; or set it once in config.toml."
         " It was last met on a CAN bus, at address 0x21."
     )
+    for address, place in ((0x0A, "0x0A"), (0, None)):
+        station.nodes.remember(UUID, can_address=address)
+        hint = error(LinkSettings()).hint
+        assert hint.endswith(f" It was last met on a CAN bus, at address {place}." if place else "in config.toml.")
     assert error(LinkSettings(nfc="usb")).message == "No reader is plugged in."
     assert error(LinkSettings(via_chosen=True)).message == "No reader is plugged in."
 

@@ -7,12 +7,13 @@ from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import PolicyError
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning import provision as module
 from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.provisioning.board_type import HardwareCheck
 from teds_provision.provisioning.build import BuildOrder, PreparedOrder
-from teds_provision.provisioning.progress import StepResult
+from teds_provision.provisioning.progress import StepResult, Steps
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft
 from teds_provision.teds.image import SECURITY, Image
@@ -28,6 +29,23 @@ IMAGE = Image(UUID, {(0, 12): b"name", (0, 1): b"meta"})
 def last(run: Any) -> tuple[str, str, str]:
     step: StepResult = run.steps.done[-1]
     return step.name, step.result, step.detail
+
+
+def test_a_step_is_reported_when_it_begins_and_when_it_ended_well() -> None:
+    course: list[Any] = []
+    reporter: Any = SimpleNamespace(started=course.append, finished=course.append)
+    steps = Steps(reporter)
+    with steps.step("sign") as first:
+        first.detail = "sequence 3"
+        assert (steps.current, course) == ("sign", ["sign"])
+    with pytest.raises(PolicyError), steps.step("write"):
+        raise PolicyError("It is refused.")
+    assert (steps.current, steps.done) == ("write", [first]), "the one that failed"
+    with steps.deferred("agree") as later:
+        pass
+    assert course == ["sign", first, "write", "agree"]
+    steps.finish(later)
+    assert (course[-1], steps.done) == (later, [first, later])
 
 
 @pytest.mark.parametrize(

@@ -261,6 +261,10 @@ def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Pa
     assert progress.next_row is second
     later = Progress(station.home, progress.sheet)
     assert later.row_for(board_of(5), "") is later.sheet.rows[0], "nobody has it"
+    progress.turn_away(first, board_of(3))
+    assert progress.board_of(first) == board_of(3).hex(), "the last one that was refused"
+    progress.assign_row(first, board_of(4))
+    assert progress.board_of(first) == board_of(4).hex(), "the one that has it"
 
 
 def test_a_row_that_was_tried_without_a_board_goes_before_the_one_of_a_board_that_failed_yesterday(

@@ -864,6 +864,7 @@ def test_only_the_very_image_that_starts_next_is_gone_on_with(
         ("already", "already", False),
         (RevertedError("It was reverted."), "reverted", True),
         (PolicyError("It is refused."), "refused", True),
+        (NodeRefusedError("It is busy.", reason=17), "refused", True),
         (SessionLostError(NodeSilentError("It is silent.")), "lost", True),
         (LinkClosedError("The bus was closed."), "lost", False),
     ],
@@ -1213,6 +1214,7 @@ class _Returns:
 
     def __init__(self, patch: pytest.MonkeyPatch, made: Any, *sessions: Any) -> None:
         self.left, self.restarts, self.closed = list(sessions), 0, 0
+        self.fault: TedsProvisionError = NodeRefusedError("It is busy.", reason=17)
         made._in_session = self.session
         patch.setattr(update, "_PAUSE", 0)
         patch.setattr(update, "read_about", lambda node: node.report)
@@ -1229,7 +1231,7 @@ class _Returns:
     def restart(self) -> None:
         self.restarts += 1
         if self.restarts == 1:
-            raise NodeRefusedError("It is busy.", reason=17)
+            raise self.fault
 
     def close(self) -> None:
         self.closed += 1
@@ -1511,6 +1513,40 @@ def test_an_image_that_the_board_does_not_show_after_the_upload_is_not_tried(mon
             assert course == done
             detail = "1000 octets" if "upload" in done else "already on the board"
             assert steps == ["upload", StepResult("upload", seconds=3.5, detail=detail)]
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        NodeSilentError("It is silent."),
+        NodeRefusedError("It is busy.", reason=17),
+        PolicyError("The board's image manager refused it."),
+        NotAuthenticError("The reply was altered."),
+    ],
+    ids=lambda fault: type(fault).__name__,
+)
+def test_whatever_comes_of_the_restart_the_board_is_waited_for_until_its_old_image_runs(
+    monkeypatch: pytest.MonkeyPatch, fault: TedsProvisionError
+) -> None:
+    made = an_update(wait=60.0)
+    board = _Returns(monkeypatch, made, (reported(), 1 << 40))
+    board.fault = fault
+    node: Any = SimpleNamespace(open_counter=bytes(8), contact=SimpleNamespace(link=SimpleNamespace(close=board.close)))
+    with pytest.raises(RevertedError, match="did not prove itself: It is harmful") as reverted:
+        made._revert(node, PolicyError("It is harmful."))
+    assert reverted.value.hint == "The image is at fault, not the board: it runs its old firmware again."
+    assert (board.left, board.restarts, board.closed) == ([], 1, 1)
+
+
+def test_a_plan_over_an_open_port_or_in_an_open_session_is_that_of_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    none: Any = None
+    order, planned = UpdateOrder(image_of(NEWER)), list[Any]()
+    monkeypatch.setattr(update._Update, "plan", lambda made: planned.append((made._uuid, made._order, made._timeout)))
+    monkeypatch.setattr(update._Look, "planned", lambda look, node: planned.append((look._uuid, look._order, node)))
+    update.plan_at(none, none, bytes(10), order, SilentReporter(), timeout=2.5)
+    node: Any = SimpleNamespace(uuid=bytes(10))
+    update.plan_in(none, node, order)
+    assert planned == [(bytes(10), order, 2.5), (bytes(10), order, node)]
 
 
 def test_a_board_that_does_not_come_back_from_its_trial_is_lost_after_the_wait(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -427,6 +427,12 @@ def test_of_many_refused_nodes_the_first_five_are_named(station: Station) -> Non
         plan_addition(station, listed)
     shown = ", ".join(f"{uuid.hex()} (lost)" for uuid in uuids[:5])
     assert refused.value.message == f"Revoked nodes cannot be whitelisted: {shown}."
+    for uuid in uuids[5:]:
+        station.policy.deny(RevocationRecord(uuid, None, "lost", "{}"))
+    with pytest.raises(PolicyError) as refused:
+        plan_addition(station, listed)
+    assert refused.value.message == f"Revoked nodes cannot be whitelisted: {shown} and 2 more."
+    assert refused.value.hint == "Nothing was added."
 
 
 @pytest.mark.parametrize(("name", "good"), [("a" * 200, True), ("a" * 201, False), ("a\tb", False), ("", True)])

@@ -387,6 +387,7 @@ def test_what_a_person_is_asked_before_an_image_is_written(
 
     def written(*_: Any, **how: Any) -> Any:
         assert (how["jump"], how["facts"]) == (jump, {"profile": "gripper"})
+        assert (how["low"], how["progress"]) == (person.low_battery, reporter.written)
         course.append("written")
         raise PolicyError("far enough")
 
@@ -401,7 +402,8 @@ def test_what_a_person_is_asked_before_an_image_is_written(
     monkeypatch.setattr(writing, "shown_by", lambda *_: {})
     monkeypatch.setattr(writing, "is_remembered", lambda *_, factory: known and not factory)
     monkeypatch.setattr(writing, "write", written)
-    how: dict[str, Any] = {"file": None, "operator": Person(), "jump": jump, "retyped": retyped}
+    person, reporter = Person(), SilentReporter()
+    how: dict[str, Any] = {"file": None, "operator": person, "jump": jump, "retyped": retyped}
     with pytest.raises(PolicyError, match="far enough"):
-        writing.write_at(station, LinkSettings(), image.uuid.hex(), SilentReporter(), **how)
+        writing.write_at(station, LinkSettings(), image.uuid.hex(), reporter, **how)
     assert course == (["jump", "session", "written"] if jump else ["session", *asked, "written"])

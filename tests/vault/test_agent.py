@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
 import pytest
@@ -212,6 +213,36 @@ def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
     assert opens(home) == 0
     os.kill(process_of(home), signal.SIGTERM)
     wait_until(lambda: not (home / agent.SOCKET).exists())
+
+
+def test_every_signal_that_ends_it_wipes_its_page_and_so_does_a_secret_that_does_not_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course: list[Any] = []
+
+    class Page:
+        def read(self, descriptor: int) -> None:
+            course.append(descriptor)
+            raise ValueError("longer than any secret")
+
+        def wipe(self) -> None:
+            course.append("wiped")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.argv", ["agent", str(tmp_path), "60"])
+        patch.setattr(agent, "harden", lambda: course.append("hardened"))
+        patch.setattr(agent, "LockedPage", Page)
+        patch.setattr(agent, "signal", SimpleNamespace(**{
+            name: getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP")
+        }, signal=lambda *how: course.append(how)))  # fmt: skip
+        with pytest.raises(ValueError, match="longer than any secret"):
+            agent.main()
+    ends = [(number, agent._end) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
+    assert course == ["hardened", *ends, 0, "wiped"]
+    with pytest.raises(SystemExit) as ended:
+        agent._end(signal.SIGHUP, None)
+    assert ended.value.code == 0
+    assert not (tmp_path / agent.SOCKET).exists()
 
 
 def test_one_that_ends_leaves_the_socket_of_another_that_took_its_place(tmp_path: Path) -> None:
