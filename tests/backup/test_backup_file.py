@@ -22,7 +22,7 @@ from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.restore import open_present
 from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, WrongPassphraseError
-from teds_provision.protocol.keys import SoftwareKey, verify
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, verify
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord
 from tests.backup.backups import ONE, POINT, SEALED, TWO, back_up, copy_of, opened, opened_octets, restored_into
@@ -124,8 +124,10 @@ def test_a_recovery_key_opens_it_and_no_other(station: Station, tmp_path: Path) 
     assert sealed.is_for_key
     with sealed.open_with_key(recovery) as content:
         assert content.point == station.point
-    with pytest.raises(PolicyError, match="sealed to the recovery key"):
+    with pytest.raises(PolicyError) as refused:
         sealed.open_with_key(SoftwareKey.generate())
+    digits = fingerprint(recovery.point)[:32]
+    assert refused.value.message == f"The backup is sealed to the recovery key {digits}, not to this one."
     path.write_bytes(path.read_bytes().replace(b'"tag":"', b'"tag":"A', 1))
     with pytest.raises((NotAuthenticError, BadDataError)):
         SealedFile(path).open_with_key(recovery)

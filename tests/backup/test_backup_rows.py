@@ -77,6 +77,9 @@ def test_the_chunks_are_those_of_stream_and_the_last_one_alone_is_marked() -> No
     nonces = [number.to_bytes(11, "big") + (b"\1" if number == 3 else b"\0") for number in range(4)]
     opened = [AESGCM(key).decrypt(nonce, chunk, context) for nonce, chunk in zip(nonces, chunks, strict=True)]
     assert b"".join(opened) == clear
+    with pytest.raises(BadDataError, match="cut off: its end is missing") as cut:
+        ChunkReader(io.BytesIO(b"".join(chunks)), key, context).read(len(clear))
+    assert cut.value.hint == "Use another copy."
     for left in range(1, 4):
         reader = ChunkReader(io.BytesIO(b"".join(chunks[:left]) + b"teds-backup end\n"), key, context)
         with pytest.raises(NotAuthenticError):

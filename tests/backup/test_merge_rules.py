@@ -102,6 +102,11 @@ def test_what_the_copy_alone_has(two: Two, what: str, put: Put, comes_back_from:
             assert dict(+done.kept) == {}
             assert (b"".join(live.rows()) != whole) is comes
 
+    put(two.live)
+    for how in (OLDER, SAME, NEWER, OTHER):
+        done = two.merged(how)
+        assert (dict(done.back), dict(done.kept)) == ({}, {}), "both have the same"
+
 
 NODE = NodeRecord(A, POINT, "old", epoch=3, sequence=5)
 
@@ -280,11 +285,12 @@ TRUSTED = TrustRecord("north", "ca", POINT, KEY, AT)
 @pytest.mark.parametrize("how", [OLDER, OTHER])
 def test_what_a_person_ended_here_stays_ended(two: Two, how: Relation) -> None:
     ban = RevocationRecord(B, None, "lost", "a.b.c", AT)
-    two.copy.policy.restore_trust(TRUSTED)
     two.copy.policy.deny(ban)
-    two.copy.pins.restore([WhitelistEntry(A, KEY, AT)])
     two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY)
     two.live.audit("decommission", A, "replaced by another")
+    ended = {entry.act: entry.at for entry in two.live.audit_log.entries()}
+    two.copy.policy.restore_trust(replace(TRUSTED, added=ended["trust"]))
+    two.copy.pins.restore([WhitelistEntry(A, KEY, ended["decommission"])])  # of the same second
     two.live.policy.restore_lifted(hash_of_statement(ban.statement), b"m" * 16)
     done = two.merged(how)
     assert dict(done.back) == {}
@@ -314,6 +320,9 @@ def test_trust_that_was_only_begun_here_is_not_taken_for_ended(two: Two, how: Re
 
 
 def test_trust_that_a_newer_copy_ended_ends_here(two: Two) -> None:
+    two.live.policy.restore_trust(TRUSTED)
+    two.merged(NEWER)
+    assert [record.name for record in two.live.policy.trust_rows()] == ["north"], "nobody ended it"
     for how, names in ((OTHER, ["north"]), (NEWER, [])):
         two.live.policy.restore_trust(TRUSTED)
         two.live.audit("trust", None, "removed", name="north", role="ca", key=KEY)  # as extend_audit brings it

@@ -28,6 +28,7 @@ from teds_provision.errors import (
 )
 from teds_provision.protocol.handover.strict_json import dump
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.plant.plant import HOME_FILE, PlantRecord
 from teds_provision.station.snapshot import place, set_aside
 from teds_provision.station.station import Station
 from teds_provision.vault.master import Material
@@ -180,6 +181,14 @@ def test_a_key_without_proof_is_to_be_rotated_after_a_restore_too(station: Stati
         {"created": content.created, "keystore": "file", "rotations_due": 3},
     )
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("in_plant", [False, True])
+def test_a_home_is_a_new_one_to_its_plant_if_it_has_one(station: Station, tmp_path: Path, in_plant: bool) -> None:
+    if in_plant:
+        station.plant.put_record(PlantRecord("11111111-2222-4333-8444-555555555555"))
+    restored_into(tmp_path / "new", copy_of(station, tmp_path))
+    assert (tmp_path / "new" / HOME_FILE).exists() is in_plant
 
 
 def test_a_rebuilt_station_names_the_keystore_of_this_machine(station: Station, tmp_path: Path) -> None:

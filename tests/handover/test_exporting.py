@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import stat
 from dataclasses import replace
@@ -15,12 +16,15 @@ from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import (
     ExportOrder,
+    _announced,
     _of_the_last_run,
     export_all,
     export_bundle,
     outputs_of,
     plan_export,
     plan_exports,
+    record_export,
+    seal_export,
 )
 from teds_provision.handover.pending import BundleNotes, close, find_handover, undo
 from teds_provision.protocol.handover.bundle import open_bundle
@@ -173,6 +177,34 @@ def test_of_two_bundles_neither_is_made_beside_a_file_that_is_in_the_way(tmp_pat
     notes = [BundleNotes.from_json(row.nodes) for row in pair.north.handovers.all()]
     assert [note.run for note in notes] == [made[0].plan.id] * 2
     pair.close()
+
+
+def test_bundles_of_a_command_that_was_cut_stay_together(tmp_path: Path) -> None:
+    pair = Pair.make(tmp_path, 2)
+    order = ExportOrder(("south",), tuple(board.uuid for board in pair.boards), "move")
+    first, _ = plan_exports(pair.north, order, most=1)
+    with pair.north.transaction():
+        _announced(pair.north, first, "the first command")
+    plans = plan_exports(pair.north, order, most=1)
+    assert [plan.earlier is not None for plan in plans] == [True, False]
+    export_all(pair.north, plans, outputs_of(tmp_path / "out.jwe", 2))
+    notes = [BundleNotes.from_json(row.nodes) for row in pair.north.handovers.all()]
+    assert [note.run for note in notes] == ["the first command"] * 2
+    pair.close()
+
+
+def test_a_bundle_that_is_sealed_for_a_parcel_is_recorded_as_its_file_would_be(pair: Pair) -> None:
+    now = datetime(2026, 3, 1, 8, 0, 0, 999_999, tzinfo=UTC)
+    plan = plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,), "copy"), now=now)
+    sealed = seal_export(pair.north, plan, now)
+    assert sealed.sha256 == hashlib.sha256(sealed.octets).hexdigest()
+    with pair.north.transaction():
+        record_export(pair.north, sealed)
+    (row,) = pair.north.handovers.all()
+    notes = BundleNotes.from_json(row.nodes)
+    assert (notes.files, notes.created) == ((sealed.sha256, sealed.signed_sha256), "2026-03-01T08:00:00Z")
+    assert sealed.signed_sha256 != sealed.sha256
+    assert isinstance(plan_import(pair.south, sealed.octets, now), ImportPlan)
 
 
 def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) -> None:

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, NotFoundError, PolicyError
+from teds_provision.errors import (
+    BadDataError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
+    VaultError,
+)
 from teds_provision.handover import trust as fleet
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
@@ -22,6 +29,7 @@ from teds_provision.handover.trust import (
     sign_request,
     write_certificate,
 )
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder, build
@@ -317,6 +325,28 @@ def forged() -> bytes:
     return write_certificate(Certificate("x", station.point, stranger.point, station.sign(b"no")))
 
 
+@pytest.mark.parametrize("cut", [KeyboardInterrupt(), VaultError("It is locked.")], ids=["Ctrl-C", "locked"])
+def test_a_station_that_is_not_completed_is_closed(
+    tmp_path: Path, owner: Station, monkeypatch: pytest.MonkeyPatch, cut: BaseException
+) -> None:
+    certificate = sign_request(owner, read_request(request(tmp_path / "east", "east")))
+    closed: list[str] = []
+    whole = Station.close
+
+    def close(station: Station) -> None:
+        closed.append(station.name)
+        whole(station)
+
+    def fail(*_: object) -> None:
+        raise cut
+
+    monkeypatch.setattr(Station, "close", close)
+    monkeypatch.setattr(fleet, "_adopt", fail)
+    with pytest.raises(type(cut)):
+        adopt_certificate(tmp_path / "east", certificate, ask=ask)
+    assert closed == ["east"]
+
+
 def test_adopting_again_changes_nothing(tmp_path: Path, owner: Station) -> None:
     home = tmp_path / "east"
     certificate = sign_request(owner, read_request(request(home, "east")))
@@ -338,13 +368,17 @@ def test_a_station_with_its_own_ca_joins_for_the_nodes_of_another(tmp_path: Path
 
 def test_the_ca_key_is_kept_away_and_brought_back(tmp_path: Path, owner: Station) -> None:
     path = tmp_path / "ca.pem"
-    fleet.export_ca(owner, owner.vault, path, "a long enough passphrase")
+    assert fleet.export_ca(owner, owner.vault, path, "a long enough passphrase")
+    assert not fleet.export_ca(owner, owner.vault, path, "a long enough passphrase"), "it is there"
     assert fleet.drop_ca(owner)
     assert not fleet.drop_ca(owner)
     with pytest.raises(PolicyError, match="is not in this vault"):
         fleet.require_ca(owner)
     fleet.import_ca(owner, owner.vault, path, "a long enough passphrase")
     assert fleet.require_ca(owner).point == owner.ca
+    log = [(entry.outcome, entry.detail) for entry in owner.audit_log.entries() if entry.act == "ca"]
+    ca = {"ca": fingerprint(owner.ca)}
+    assert [entry for entry in log if entry[0] in ("exported", "imported")] == [("exported", ca), ("imported", ca)]
     other = make_station(tmp_path / "other", "other")
     with pytest.raises(PolicyError, match="a CA key other than"):
         fleet.import_ca(other, other.vault, path, "a long enough passphrase")

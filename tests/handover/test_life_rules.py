@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -111,7 +112,9 @@ def test_the_reason_of_a_ban(station: Station, why: str, good: bool) -> None:
         assert station.policy.revocation(OLD) is None
 
 
-def test_a_ban_that_names_no_key_is_bound_to_the_pinned_one_and_the_first_ban_stays(station: Station) -> None:
+def test_a_ban_that_names_no_key_is_bound_to_the_pinned_one_and_the_first_ban_stays(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one, two = SoftwareKey(42), SoftwareKey(43)
     deny(station, seal_revocation(one, uuid=OLD, node=None, why="lost", created=JANUARY), key=PIN)
     deny(station, seal_revocation(two, uuid=OLD, node="cd" * 32, why="burnt", created=FEBRUARY), key=PIN)
@@ -122,8 +125,14 @@ def test_a_ban_that_names_no_key_is_bound_to_the_pinned_one_and_the_first_ban_st
     other = station.policy.revocation(NEW)
     assert other is not None
     assert other.fingerprint == "cd" * 32, "the key that the statement names goes before the pinned one"
-    assert lift(station, OLD)
-    assert not lift(station, OLD)
+    course: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(station, "unlock", lambda: course.append("unlocked"))
+        patch.setattr(station, "transaction", lambda: (course.append("begun"), nullcontext())[1])
+        assert lift(station, OLD)
+        assert course == ["unlocked", "begun"], "no transaction waits for a passphrase"
+        assert not lift(station, OLD)
+        assert len(course) == 2
     assert [entry.uuid for entry in station.policy.revocations()] == [NEW]
     last = list(station.audit_log.entries())[-1]
     assert (last.act, last.uuid, last.outcome, last.detail) == ("revoke", OLD, "lifted", {"why": "lost"})

@@ -95,6 +95,8 @@ def test_the_receiver_of_a_move_rotates_at_its_first_contact(pair: Pair) -> None
     with talk(pair.board, MemoryLink(pair.board, via="can", tapped=False)) as node:
         proven = prove_node(pair.south, node)
     assert (proven.rotated, proven.epoch) == (True, 2)
+    last = list(pair.south.audit_log.entries())[-1]
+    assert (last.act, last.outcome, last.detail) == ("handover", "taken over", {"epoch": 2, "rotated": True})
     assert node_key_id(pair.board) != before
     assert held(pair.south, pair.board) == [("active", 2, "agreement")]
     assert proven_of(pair.south, [pair.board.uuid]) == {pair.board.uuid}

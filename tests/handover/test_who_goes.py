@@ -191,6 +191,13 @@ def test_nodes_are_divided_and_those_of_an_open_move_stay_together(north: Statio
     moved(north, C)
     parts = plan_exports(north, ExportOrder(("south",), (A, B, C, D), "move"), most=2, now=NOW)
     assert [[node.uuid for node in part.nodes] for part in parts] == [[C], [A, B], [D]]
+    north.nodes.unpin(D)
+    parts = plan_exports(north, ExportOrder(("south",), None, "move"), most=1, now=NOW)
+    away = f"{AWAY} {TO_SOUTH[:16]}"
+    assert [([node.uuid for node in part.nodes], part.skipped) for part in parts] == [
+        ([A], ((C, away), (D, NO_POINT))), ([B], ())
+    ], "what stays is named once"  # fmt: skip
+    north.nodes.put(NodeRecord(D, NODE))
     with pytest.raises(UsageError, match="too many nodes for one bundle"):
         plan(north, A, C, mode="move")
     assert [path.name for path in outputs_of(Path("out.jwe"), 3)] == ["out.jwe", "out.jwe.2", "out.jwe.3"]

@@ -158,3 +158,12 @@ def test_no_octets_raise_anything_foreign(tmp_path_factory: pytest.TempPathFacto
     path.write_text(pem_of(octets))
     with pytest.raises((TedsProvisionError, WrongPassphraseError)):
         read_ca(path, WORDS)
+
+
+def test_salt_and_iv_are_two_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = [b"a random number!", b"and another one!"]
+    with monkeypatch.context() as patch:
+        patch.setattr("os.urandom", lambda octets: left.pop(0)[:octets])
+        pem = ca_file._encrypted_pem(b"der", "four random words")
+    der = base64.b64decode("".join(pem.decode().splitlines()[1:-1]))
+    assert [octets in der for octets in (b"a random number!", b"and another one!")] == [True, True]

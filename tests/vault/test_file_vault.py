@@ -16,10 +16,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import StoreError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
+from teds_provision.errors import (
+    KeyringUnavailableError,
+    StoreError,
+    UsageError,
+    VaultChangedError,
+    VaultError,
+    WrongPassphraseError,
+)
 from teds_provision.protocol.keys import SoftwareKey, verify
 from teds_provision.vault import file_vault
 from teds_provision.vault.file_vault import FileVault
+from teds_provision.vault.keyring_vault import KeyringVault
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, seal, unseal
 from teds_provision.vault.selection import create_vault, open_vault
@@ -386,8 +394,40 @@ def test_an_older_backup_brings_back_old_master_keys_without_losing_the_new(tmp_
     vault.add_master()
     vault.retire_masters()
     new = vault.wrap(b"n" * 16, context=b"c")
+    for keystore, why in (("file", "as requested"), (None, "the passphrase file already exists")):
+        (tmp_path / "copy").mkdir(exist_ok=True)
+        (tmp_path / "copy" / "vault.json").write_bytes((tmp_path / "vault.json").read_bytes())
+        made = create_vault(tmp_path / "copy", STORE, keystore, Person(), restored=backup)
+        assert (made[0].unwrap(old, context=b"c"), made[1]) == (b"o" * 16, why)
     restored, _ = create_vault(tmp_path, STORE, "file", Person(), restored=backup)
     assert (restored.unwrap(old, context=b"c"), restored.unwrap(new, context=b"c")) == (b"o" * 16, b"n" * 16)
+
+
+def no_keyring(*_: object, **__: object) -> KeyringVault:
+    raise KeyringUnavailableError("There is no keyring.")
+
+
+def test_reason_place_and_duration_are_given_before_a_new_passphrase_and_only_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes: list[str] = []
+    monkeypatch.setattr(KeyringVault, "create", no_keyring)
+    for keystore, begin in (("file", ""), (None, "No OS keyring was found. ")):
+        home = tmp_path / str(keystore)
+        home.mkdir()
+        for _ in range(2):
+            create_vault(home, STORE, keystore, Person(), costs=THROWAWAY, notify=notes.append)
+        (note,) = notes
+        notes.clear()
+        assert note.startswith(f"{begin}The station's keys will be stored in {home / 'vault.json'}, encrypted with a")
+        assert note.endswith(" At least 8 characters; four random words are good. This takes about a second.")
+
+
+def test_a_vault_behind_a_symbolic_link_is_not_opened(tmp_path: Path, vault: FileVault) -> None:
+    (tmp_path / "vault.json").rename(tmp_path / "elsewhere.json")
+    (tmp_path / "vault.json").symlink_to(tmp_path / "elsewhere.json")
+    with pytest.raises(VaultError):
+        FileVault.open(tmp_path, STORE, Person())
 
 
 def test_an_unknown_keystore_is_a_usage_error(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +201,13 @@ def test_a_new_passphrase(passphrase: str, why: str | None) -> None:
         check_new(passphrase)
     with pytest.raises(VaultError, match=why):
         seal(passphrase, b"", context=b"", costs=CHEAP)
+
+
+def test_a_python_without_argon2id_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.kdf.argon2", None)
+    with pytest.raises(VaultError, match="has no Argon2id") as refused:
+        SealingKey.derive(GOOD, costs=CHEAP)
+    assert refused.value.hint == "Install the wheel of cryptography from PyPI."
 
 
 def test_a_passphrase_is_taken_in_unicodes_form_kc() -> None:

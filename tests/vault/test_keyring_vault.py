@@ -193,6 +193,29 @@ def test_what_is_written_is_made_from_what_is_in_the_keyring_now(monkeypatch: py
     assert backend.entries == {}
 
 
+def test_a_keyring_that_has_an_entry_is_not_tried_out_and_takes_in_the_keys_of_a_backup(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    name, backend = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}", MemoryKeyring()
+    tried: list[str] = []
+    monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
+    monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, backend)]))
+    monkeypatch.setattr(keyring_vault, "_probe", lambda probed, _backend: tried.append(probed))
+    vault = KeyringVault.create(STORE)
+    assert tried == [name]
+    backup, old = vault.secret_material(), vault.wrap(b"o" * 16, context=b"c")
+    vault.add_master()
+    vault.retire_masters()
+    new = vault.wrap(b"n" * 16, context=b"c")
+    lines = dict(backend.entries)
+    KeyringVault.create(STORE)
+    assert (tried, backend.entries) == ([name], lines), "nothing is written that is there already"
+    KeyringVault.create(STORE, restored=backup)
+    again = KeyringVault.open(STORE)
+    assert tried == [name]
+    assert [again.unwrap(wrapped, context=b"c") for wrapped in (old, new)] == [b"o" * 16, b"n" * 16]
+
+
 class BrokenKeyring(MemoryKeyring):
     """A keyring that answers nothing, for a reason of its own."""
 

@@ -22,6 +22,20 @@ def test_every_attribute_is_read():
     assert Pkcs11Uri.parse("PKCS11:" + M) == Pkcs11Uri("/lib/m.so")
 
 
+@pytest.mark.parametrize(
+    ("path", "shown"),
+    [
+        ("token=hand;serial=7;slot-id=0", "token 'hand'"),
+        ("serial=7;slot-id=0", "token with the serial number 7"),
+        ("slot-id=0", "token in slot 0"),
+        ("slot-id=3", "token in slot 3"),
+        ("model=1", "token"),
+    ],
+)
+def test_a_token_is_called_by_its_label_else_its_number_else_its_slot(path: str, shown: str) -> None:
+    assert str(Pkcs11Uri.parse(f"pkcs11:{path}{M}")) == shown
+
+
 @pytest.mark.parametrize("query", ["pin-value=1234", "pin-source=file:/etc/pin", "pin-source=%7Cprog", "pin-value="])
 @pytest.mark.parametrize("between", ["&", "?"])
 def test_no_uri_may_hold_a_pin_and_the_message_does_not_repeat_it(query, between):

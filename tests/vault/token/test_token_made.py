@@ -126,6 +126,21 @@ def test_a_key_of_another_curve_is_not_used(vault, home, store_id, uri):
         Pkcs11Vault.create(home / "b", store_id, uri.replace("?", ";object=wide?"), Person())
 
 
+def test_a_token_that_is_pulled_while_the_ca_key_is_destroyed_leaves_a_vault_that_opens(
+    vault, home, store_id, uri, monkeypatch
+):
+    """The file names the key no more before it is gone: else the file would name one that the token lacks."""
+    monkeypatch.setattr(vault._session, "destroy", lambda key: (destroy(key), pulled()))
+    destroy = type(vault._session).destroy.__get__(vault._session)
+
+    def pulled():
+        raise VaultError("The token was removed.")
+
+    with pytest.raises(VaultError, match="was removed"):
+        vault.drop_ca()
+    assert Pkcs11Vault.open(home, store_id, uri, Person()).ca() is None
+
+
 def test_the_ca_key_can_be_destroyed_and_then_it_is_gone(vault, home, store_id, uri):
     assert vault.drop_ca()
     assert vault.ca() is None

@@ -71,6 +71,21 @@ def test_a_module_that_cannot_be_loaded(home, store_id, uris, module):
     assert "driver" in refused.value.hint
 
 
+def test_a_module_that_was_loaded_and_then_fails_is_not_called_one_that_cannot_be_loaded(monkeypatch):
+    import pkcs11
+    from pkcs11.exceptions import GeneralError
+
+    def fails(error):
+        monkeypatch.setattr(pkcs11, "lib", lambda _path: (_ for _ in ()).throw(error))
+        with pytest.raises(VaultError) as refused:
+            find_token(Pkcs11Uri("/m.so", token="t"))
+        return refused.value.message
+
+    unloaded = "The PKCS #11 module /m.so cannot be loaded."
+    assert fails(pkcs11.PKCS11Error("no such file")) == unloaded
+    assert fails(GeneralError()) != unloaded
+
+
 def test_a_token_that_is_not_there_or_not_clear(home, store_id, uris):
     with pytest.raises(VaultError, match="no token 'nobody'") as refused:
         Pkcs11Vault.create(home, store_id, f"pkcs11:token=nobody?module-path={MODULE}", Person())
