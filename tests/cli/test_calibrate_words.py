@@ -142,6 +142,8 @@ def test_a_zero_as_json_is_si_with_the_shown_unit_beside(home: Path, monkeypatch
     ("words", "message"),
     [
         (("zero", NODE, "1", "--value", "nan", *BUS), "--value is not a finite number."),
+        (("zero", NODE, "1", "--value", "inf", *BUS), "--value is not a finite number."),
+        (("capture", NODE, "1", "--reference", "nan", "--to", "x.csv", *BUS), "--reference is not a finite number."),
         (("capture", NODE, "1", "--reference", "inf", "--to", "x.csv", *BUS), "--reference is not a finite number."),
         (("fit", "points.csv", "--laboratory", "points.csv"), "--laboratory belongs to a certificate."),
         (("fit", "points.xml"), "A certificate is fitted for a transducer type."),
@@ -349,3 +351,39 @@ def test_a_certificate_has_the_laboratory_the_node_the_day_and_the_program(home:
     assert str(datetime.now(UTC).date()) in text
     call(home, *words, passphrase=None)
     assert "Metrology of Stockholm" not in dcc.read_text(), "written again, without the laboratory"
+
+
+def test_a_zero_in_a_unit_with_an_offset_shows_differences_as_differences(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A spread of 0.25 K is 0.25 °C, and not -272.9 °C; the name of a channel is foreign text."""
+    celsius = replace(angle(), name="oil\nWritten", units=parse_unit("K").units, display="degC")
+    warm = replace(ZEROED, channel=celsius, offset=1.5, moved=-0.5, before=293.15, after=292.65, spread=0.25)
+    outcome, _ = zero(home, monkeypatch, warm, "1")
+    assert outcome.out.splitlines()[0] == (
+        "Channel 1 (oil?Written) read 20 °C (16 samples, spread 0.25 °C) and now reads 19.5 °C: "
+        "zero offset 1.5 °C (moved by -0.5 °C)."
+    )
+
+
+def test_the_largest_error_may_be_one_below_the_curve(home: Path, tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text("raw,value [degree]\n0,0\n100,90\n200,150\n300,270\n")
+    found = call(home, "--json", "calibrate", "fit", file, passphrase=None).json["left_out"]
+    # without 100 its value would be 75, without 200 it would be 180
+    assert found == {"maximum": pytest.approx(30.0), "rms": pytest.approx(math.sqrt((225 + 900) / 2))}
+
+
+@pytest.mark.parametrize("name", ["JOINT.XML", "joint.Xml"])
+def test_a_certificate_is_one_in_any_case_of_its_extension(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    file = tmp_path / name
+    file.write_bytes(b"\xff\xfe<certificate/>")
+    refused = call(home, "--json", "calibrate", "fit", file)
+    assert (refused.code, refused.json["error"]["message"]) == (2, "A certificate is fitted for a transducer type.")
+    one = fit_points(FIT, "points.csv")
+    monkeypatch.setattr(
+        provisioning.build, "prepare", lambda _station, _order: SimpleNamespace(calibrations=one, warnings=())
+    )
+    assert call(home, "calibrate", "fit", file, "-p", NAMED).code == 0, "it is not read as text"

@@ -142,3 +142,10 @@ def test_a_plan_names_the_measurements_that_would_end(measured: Path) -> None:
     assert (plan["ended"], [group["name"] for group in plan["groups"]]) == (["1a2b3c4d"], ["crane", "spare"])
     assert "ended" not in call(measured, "--json", "group", "delete", "spare", "--dry-run").json
     assert kept(measured) == ["1a2b3c4d"]
+
+
+def test_one_measurement_of_a_group_is_one(measured: Path) -> None:
+    plan = call(measured, "group", "delete", "crane", "--dry-run")
+    assert plan.err == "Would delete group crane and its measurement 1a2b3c4d.\n"
+    assert kept(measured) == ["1a2b3c4d"]
+    assert "Also deleted: measurement 1a2b3c4d." in call(measured, "group", "delete", "crane", "--yes").err

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from teds_provision.cli.node import virtual_nodes
-from teds_provision.errors import KnownUuidError, UsageError
+from teds_provision.errors import KnownUuidError, LinkError, NotFoundError, StoreError, UsageError
 from teds_provision.node import node_template
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.wrapped.running import SensorPlace
@@ -129,3 +129,25 @@ def test_a_wrapped_node_among_others_gives_no_made_up_values(
         virtual_nodes._wrapped(none, none, [tmp_path / "plain", tmp_path / "torque"], SensorPlace("noise"))
     assert refused.value.hint == f"Use --source {source}."
     assert str(tmp_path / "torque") in refused.value.message
+
+
+def test_neither_a_broken_store_nor_an_ncap_that_does_not_know_it_hinders_a_node(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> Any:
+        raise StoreError("The disk is away.")
+
+    app: Any = SimpleNamespace(home=home, station=broken)
+    assert virtual_nodes._known_as(app, UUID) is None
+    (home / "ncap.sock").touch()
+    for error in (NotFoundError("No such node."), LinkError("It has just ended."), None):
+
+        def node(_uuid: str, error: Exception | None = error) -> None:
+            if error is not None:
+                raise error
+
+        monkeypatch.setattr(
+            virtual_nodes, "client", SimpleNamespace(connect=lambda home, node=node: SimpleNamespace(node=node))
+        )
+        known = None if error is not None else "A node on a link of the running ncap"
+        assert virtual_nodes._known_as(app, UUID) == known

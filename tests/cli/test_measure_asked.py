@@ -306,3 +306,17 @@ def test_a_measurement_is_in_the_log_with_its_end_and_its_ports_are_closed(
         assert measure_command._run(app, job, LinkSettings("can"), [UUID, OTHER], 2.5) is ended
         outcome = "done" if error is None else "node-silent"
         assert log == [*begun, "closed", "closed", ("measure", None, outcome, facts)]
+
+
+@pytest.mark.parametrize("url", ["broker", "mqtt:broker", "mqttx://broker", "http://broker", ""])
+def test_a_broker_is_named_by_its_url(asked: Asked, home: Path, url: str) -> None:
+    refused = call(home, "--json", "measure", NODE, "--mqtt", url, *BUS)
+    assert (refused.code, refused.json["error"]) == (
+        2,
+        {
+            "code": "usage",
+            "message": f"--mqtt {url!r} is not a broker URL.",
+            "hint": "Use mqtt://HOST or mqtts://USER@HOST.",
+        },
+    )
+    assert asked.kept is None

@@ -6,6 +6,7 @@ import io
 import json
 import sys
 import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -182,3 +183,45 @@ def test_the_table_ends_after_40_rows() -> None:
     live = LiveTable(Said().app(), [])
     live.block(block(*map(float, range(41)), channels=tuple(range(1, 42))))
     assert len(cells(live._table())) == 40
+
+
+@pytest.mark.parametrize(
+    ("quiet", "terminal", "table"), [(False, True, True), (True, True, False), (False, False, False)]
+)
+def test_who_wants_it_quiet_or_writes_into_a_file_has_no_table(
+    monkeypatch: pytest.MonkeyPatch, quiet: bool, terminal: bool, table: bool
+) -> None:
+    monkeypatch.setattr(sys, "stdout", SimpleNamespace(isatty=lambda: terminal))
+    shown: list[str] = []
+
+    class Table:
+        def __init__(self, *_: object) -> None:
+            self.block = self.facts = self.report = self.sink = None
+
+        def shown(self) -> Any:
+            shown.append("table")
+            return nullcontext(self)
+
+    monkeypatch.setattr(measure_view, "LiveTable", Table)
+    app: Any = SimpleNamespace(json=False, quiet=quiet, warn=None, note=None)
+    station: Any = SimpleNamespace(name="bench")
+    with measure_view.watcher_for(app, station, [], threading.Event()):
+        assert shown == (["table"] if table else [])
+
+
+def test_another_reason_is_a_change_in_plain_lines_too() -> None:
+    said = Said()
+    plain = PlainLines(said.app())
+    for why in ("it is silent", "it is silent", "it is far"):
+        plain.report(NodeReport(UUID, "waiting", why))
+    plain.report(NodeReport(OTHER, "waiting", "it is far"))
+    assert said.notes == [
+        f"{UUID}: waiting: it is silent", f"{UUID}: waiting: it is far", f"{OTHER}: waiting: it is far",
+    ]  # fmt: skip
+
+
+def test_rows_of_the_table_are_by_node_and_channel_whoever_came_first() -> None:
+    live = LiveTable(Said().app(), [])
+    live.block(block(1.0, 2.0, uuid=OTHER, channels=(3, 1)))
+    live.block(block(3.0, uuid=UUID))
+    assert [row[0] + row[1][-1] for row in cells(live._table())] == [f"{UUID[:8]}1", f"{OTHER[:8]}1", f"{OTHER[:8]}3"]

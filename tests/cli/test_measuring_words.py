@@ -612,3 +612,116 @@ def test_a_terminal_that_is_closed_ends_in_order_unless_that_is_ignored() -> Non
             assert signal.getsignal(signal.SIGHUP) == handler
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_of_several_nodes_with_one_number_the_first_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    third = bytes(range(20, 30))
+    of = {UUID: 2, OTHER: 2, third: 5}
+    monkeypatch.setattr(
+        Sheet,
+        "from_image",
+        lambda image: SimpleNamespace(chosen=lambda _name, _uuid: SimpleNamespace(number=of[image])),
+    )
+    station: Any = SimpleNamespace(datasheets=SimpleNamespace(datasheet=lambda uuid: uuid))
+    with pytest.raises(UsageError) as refused:
+        measure_command._numbers(station, [UUID, OTHER, third], ["opening"])
+    assert refused.value.message == f"Channel 'opening' has different numbers: 2 on {NODE}, 5 on {third.hex()}."
+    assert measure_command._numbers(station, [UUID, OTHER], ["opening", "grip"]) == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ("error", "lines"), [(None, []), (PolicyError("It does not fit."), ["rate is 1 Hz.", "range is not known."])]
+)
+def test_unmet_requirements_are_listed_if_they_ended_the_measurement(error: Any, lines: list[str]) -> None:
+    fits = [
+        {"uuid": NODE, "result": "passed", "why": "it fits"},
+        {"uuid": NODE, "result": "failed", "why": "rate is 1 Hz."},
+        {"uuid": NODE, "result": "skipped", "why": "range is not known."},
+    ]
+    require: Any = SimpleNamespace(fits=fits)
+    ended = MeasurementEnd([], ["run.csv"], error)
+    assert measure_command._end_lines(ended, require) == ["Written: run.csv", *lines]
+    assert measure_command._end_lines(ended, None) == ["Written: run.csv"]
+
+
+def test_the_unit_of_files_is_named_only_if_there_are_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = App.current
+    app = App(home=tmp_path, as_json=True)
+    measure_command._print_end(app, MeasurementEnd([], [], None), None, "shown", "")
+    assert json.loads(capsys.readouterr().out) == {"event": "end", "nodes": [], "files": [], "sinks": []}
+    App.current = before
+
+
+@pytest.mark.parametrize(
+    ("given", "typed", "bus"),
+    [
+        ({"can": "c", "ble": "b"}, set(), "can"),
+        ({"can": "c", "ble": "b"}, {"ble"}, "ble"),
+        ({"can": "c", "ble": "b"}, {"can", "ble"}, "can"),
+        ({"can": "c"}, {"nfc"}, "can"),
+        ({"ble": "b"}, set(), "ble"),
+        ({}, {"via"}, None),
+    ],
+)
+def test_of_two_buses_the_one_on_the_command_line_is_meant(
+    given: dict[str, str], typed: set[str], bus: str | None
+) -> None:
+    assert sample_command._bus_meant(LinkSettings("nfc", **given), typed) == bus  # type: ignore[arg-type]
+
+
+def test_a_session_that_is_lost_ends_a_command_with_what_lost_it(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    met: list[Any] = []
+
+    @contextmanager
+    def meet(_station: Any, links: LinkSettings, uuid: bytes, _reporter: Any, *, before: Any) -> Iterator[str]:
+        met.append((links.via, uuid))
+        before()
+        yield "node"
+        met.append("left")
+
+    monkeypatch.setattr(provisioning.meeting, "meet", meet)
+    monkeypatch.setattr(measure.verified_session, "open_trusted", lambda _station, node, *, by: (node, by))
+    unlocked: list[bytes] = []
+    station: Any = SimpleNamespace(unlock=unlocked.append)
+    links = LinkSettings("can", can="virtual:x")
+    before = App.current
+    cause = NodeRefusedError("It has restarted.", reason=1)
+    app = App(home=home, quiet=True)
+    monkeypatch.setattr(sample_command, "over_the_bus", lambda links: links)
+    with sample_command.trusted_node(app, station, links, UUID, by="mode") as trusted:
+        assert trusted == ("node", "mode")  # type: ignore[comparison-overlap]
+    assert (met, unlocked) == ([("can", UUID), "left"], [UUID])
+
+    def lose() -> None:
+        with sample_command.trusted_node(app, station, links, UUID, by="mode"):
+            raise provisioning.conversation.SessionLostError(cause)
+
+    with pytest.raises(NodeRefusedError, match="It has restarted"):
+        lose()
+    App.current = before
+
+
+@pytest.mark.parametrize(
+    ("changes", "cells"),
+    [
+        ({"uncertainty": 0.0}, ["1", "angle", "90", "0", "degree", "4096"]),
+        ({"uncertainty": None}, ["1", "angle", "90", "degree", "4096"]),
+        ({"turn": 0.0, "value": 2 * math.pi - 1e-9, "uncertainty": None}, ["1", "angle", "0", "degree", "4096"]),
+        (
+            {"turn": 0.0, "shown": None, "value": -0.5, "uncertainty": None, "unit": "rad"},
+            ["1", "angle", "-0.5", "rad", "4096"],
+        ),
+    ],
+)
+def test_a_reading_within_its_turn_and_one_without_an_uncertainty(changes: dict[str, Any], cells: list[str]) -> None:
+    console = Console(file=io.StringIO(), width=120)
+    sample_command._samples(console, [replace(ANGLE, **changes)])
+    assert console.file.getvalue().splitlines()[1].split() == cells  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf", "nan"])
+def test_a_set_point_is_a_finite_number(home: Path, actuator: Standing, value: str) -> None:
+    refused = call(home, "--json", "set", NODE, "1", value, *BUS)
+    assert (refused.code, refused.json["error"]["message"]) == (2, "VALUE is not a finite number.")
+    assert Held.made == []
+    del actuator

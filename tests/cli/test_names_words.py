@@ -10,6 +10,7 @@ import pytest
 
 from teds_provision import provisioning
 from teds_provision.cli.measure import names
+from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -156,3 +157,33 @@ def test_a_node_without_a_signature_has_the_name_of_its_own_teds(
     kept[CELL] = Image(CELL, load_profile("load-cell").build(CELL, name="").blocks)
     _, (_, _, other) = names._channels(station)
     assert other.node == ("load cell" if verdict == "unsigned" else "")
+
+
+def test_slashes_around_a_name_are_no_part_of_it(desk: Path) -> None:
+    assert "/bench/slew/" in shown(desk, "set", "hand", 0, "/slew/")
+    assert f"{H} 1: /crane/slew (chosen)" in shown(desk, "set", "hand", 1, "//crane/slew/")
+    assert "/crane_7/slew/" in shown(desk, "set", "station", 0, "/crane_7")
+
+
+@pytest.mark.parametrize(
+    ("uuid", "channel", "number"),
+    [
+        (HAND, 1, 1), (HAND, 0, 0), (HAND, "OPENING", 1), (HAND, "opening", 1), (HAND, 9, None), (HAND, "twice", None),
+        (HAND, "knee", None), (b"u" * 10, 7, 7), (b"u" * 10, 0, 0), (b"u" * 10, "opening", None),
+        (names.STATION, 0, 0), (names.STATION, 1, None),
+    ],
+)  # fmt: skip
+def test_a_channel_is_one_of_the_datasheet_or_any_number_if_that_is_not_known(
+    monkeypatch: pytest.MonkeyPatch, uuid: bytes, channel: int | str, number: int | None
+) -> None:
+    twice = [(HAND, number, ChannelFacts(H, "hand", number, "Twice")) for number in (3, 4)]
+    monkeypatch.setattr(names, "_channels", lambda _station: [*KNOWN, *twice])
+    station: Any = None
+    if number is not None:
+        assert names._require_channel(station, uuid, channel) == number
+        return
+    with pytest.raises(NotFoundError) as refused:
+        names._require_channel(station, uuid, channel)
+    has = "1 (opening), 2 (grip force), 3 (Twice), 4 (Twice)" if uuid == HAND else "none"
+    assert refused.value.message == f"{uuid.hex()} has no channel {channel!r}."
+    assert refused.value.hint == f"Channels in its datasheet: {has}."

@@ -408,3 +408,14 @@ def test_only_a_harmful_calibration_counts_for_strict(
         guard = (GuardFinding(1, "c", "m", severity),)  # type: ignore[arg-type]
         monkeypatch.setattr(show, "_guard", lambda _beside, guard=guard: guard)
         assert (call(home, "show", file, "--strict").code, call(home, "show", file).code) == (code, 0)
+
+
+@pytest.mark.parametrize(
+    ("octets", "verdict", "colour"),
+    [(NAME, "clean", "32"), (NAME[4:-2], "block-clean", "32"), (NAME[:-1] + b"\0", "frame-bad", "31")],
+)
+def test_what_is_good_is_green(octets: bytes, verdict: str, colour: str) -> None:
+    out = io.StringIO()
+    console = consoles.CleanConsole(file=out, force_terminal=True, color_system="standard", width=200)
+    show.print_teds(console, describe(TedsBlock(None, None, octets), {}))
+    assert f"\x1b[{colour}m{verdict}\x1b[0m" in out.getvalue()

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import click
 import pytest
 
 from teds_provision.cli.node import virtual_nodes
 from teds_provision.cli.node.virtual_nodes import ActuatorLines
+from teds_provision.errors import LinkError
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import ActuatorReading
 from teds_provision.protocol.keys import fingerprint
@@ -514,3 +519,202 @@ def test_nodes_with_channels_have_their_source_and_a_battery_if_one_is_named(
         for number, uuid in enumerate(uuids)
     ]
     assert ([len(sheet.channels) for sheet, _ in made], warnings) == ([3, 3], [])
+
+
+@pytest.mark.parametrize(
+    ("text", "octets"),
+    [(UUID, bytes.fromhex(UUID)), (f"0x{UUID}", bytes.fromhex(UUID)), (f"0X{UUID.upper()}", bytes.fromhex(UUID)),
+     (None, None)],
+)  # fmt: skip
+def test_a_uuid_is_20_digits_with_or_without_0x(text: str | None, octets: bytes | None) -> None:
+    none: Any = None
+    assert virtual_nodes._uuid(none, none, text) == octets
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("thumb", None),
+        ("", None),
+        ("ä" * 60, None),
+        ("ä" * 61, "a name has at most 120 octets of printable text; this one has 122."),
+        ("a\tb", "a name has at most 120 octets of printable text; this one has 3."),
+        ("sch\udcf6n", "the name is not valid text in this terminal's encoding."),
+    ],
+)
+def test_a_name_is_short_printable_text(name: str, why: str | None) -> None:
+    none: Any = None
+    if why is None:
+        assert virtual_nodes._name(none, none, name) == name
+        return
+    with pytest.raises(click.BadParameter) as refused:
+        virtual_nodes._name(none, none, name)
+    assert refused.value.message == why
+
+
+def test_an_empty_message_names_one_too(home: Path, tmp_path: Path) -> None:
+    done = call(home, "--json", "node", "create", tmp_path / "a", "--message", "")
+    assert (done.code, done.json["error"]["message"]) == (2, "--message needs --from dbc:FILE.")
+
+
+def test_what_a_sensor_says_of_itself_is_noted_and_its_image_is_started(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = virtual_nodes.node_room
+    describe = room.wrapped.reading.describe
+
+    def noted(*words: Any) -> Any:
+        sensor = describe(*words)
+        first, second, *rest = sensor.channels
+        return replace(sensor, channels=(replace(first, note="no [unit]"), replace(second, note="0 to 1"), *rest))
+
+    monkeypatch.setattr(room.wrapped.reading, "describe", noted)
+    slots: list[Any] = []
+    image = SimpleNamespace(version_text="1.4.0", digest=b"\xab" * 32)
+    monkeypatch.setattr(
+        room.firmware.boot_loader.ImageSlots,
+        "create",
+        lambda *words: slots.append(words) or SimpleNamespace(running=image),
+    )
+    for name in ("image.bin", "owner.pem"):
+        (tmp_path / name).write_bytes(b"x")
+    firmware = ("--firmware", tmp_path / "image.bin", "--firmware-key", tmp_path / "owner.pem")
+    words = ("node", "create", tmp_path / "a", "--from", f"dbc:{DBC}", "--message", "Torque", *firmware)
+    made = call(home, *words)
+    assert made.err.splitlines() == ["torque: no [unit].", "speed: 0 to 1."]
+    assert made.out.endswith(", 4 channels, wraps CAN message Torque (dbc), firmware 1.4.0.\n")
+    assert slots == [(tmp_path / "a", tmp_path / "image.bin", tmp_path / "owner.pem")]
+    assert call(home, "--json", *words).json["firmware"] == {"version": "1.4.0", "image": "ab" * 32}
+
+
+def test_an_empty_battery_is_one(tmp_path: Path) -> None:
+    app: Any = SimpleNamespace(warn=None)
+    lines: Any = SimpleNamespace(observer_of=lambda _uuid: None)
+    file = FlashFile.create(tmp_path / "a", uuid=bytes.fromhex(UUID))
+    board = virtual_nodes._boards(app, lines, "noise", 0.0, None)(file)
+    assert board is not None
+    assert board.battery is not None
+    assert board.battery.power().level == 0
+
+
+@pytest.mark.parametrize(("count", "text"), [(1, f"Node {UUID} ready on a and b."), (2, "2 nodes ready on a and b.")])
+def test_nodes_that_are_ready_are_named(count: int, text: str) -> None:
+    printed = Printed()
+    keys = [bytes([number]) * 65 for number in range(count)]
+    nodes: Any = [
+        SimpleNamespace(tim=SimpleNamespace(flash=SimpleNamespace(uuid=bytes.fromhex(UUID), node_key=key)))
+        for key in keys
+    ]
+    virtual_nodes._say_ready(printed, nodes, ["a", "b"], "noise")  # type: ignore[arg-type]
+    named = [{"uuid": UUID, "fingerprint": fingerprint(key)} for key in keys]
+    several = {"nodes": named} if count > 1 else {}
+    assert printed.lines == [({**named[0], **several, "links": ["a", "b"], "source": "noise", "ready": True}, text)]
+
+
+@pytest.mark.parametrize("kind", ["event", "state"])
+def test_a_node_whose_output_a_full_disk_refuses_goes_on_too(kind: str) -> None:
+    class Full(Printed):
+        def emit(self, record: dict[str, Any], text: str) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    lines, pause = lines_on(Full(), lambda _: None)
+    (lines.note_reset if kind == "event" else lambda uuid: lines.observer_of(uuid)(state(1.0)))("aa")
+    lines._run()
+    assert pause.is_set()
+
+
+@pytest.mark.parametrize(
+    ("signal_of_end", "links", "has_can"),
+    [("SIGTERM", {"can": "virtual:x"}, True), ("SIGINT", {"nfc": "udp:1", "ble": "usb:0"}, False)],
+)
+@pytest.mark.parametrize("fails", [False, True])
+def test_nodes_run_until_a_signal_and_end_in_reverse_with_their_last_lines(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    signal_of_end: str,
+    links: dict[str, str],
+    has_can: bool,
+    fails: bool,
+) -> None:
+    course: list[Any] = []
+    handlers: dict[str, Any] = {}
+    made: list[Any] = []
+
+    class Part:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def start(self) -> None:
+            course.append(f"start {self.name}")
+            if fails and self.name == "bus":
+                raise LinkError("The bus is away.")
+
+        def stop(self) -> None:
+            course.append(f"stop {self.name}")
+
+        def locate_of(self, uuid: str) -> str:
+            return f"locate {uuid}"
+
+    class Stop:
+        ended = False
+
+        def request_stop(self) -> None:
+            self.ended = True
+
+        def wait(self, _seconds: float) -> bool:
+            handlers[signal_of_end]()
+            return self.ended
+
+    room = virtual_nodes.node_room
+    board = Part("board")
+    monkeypatch.setattr(
+        room.virtual,
+        "VirtualNode",
+        lambda folder, **how: made.append((folder, how)) or SimpleNamespace(board=board if len(made) == 1 else None),
+    )
+    monkeypatch.setattr(room.realtime_loop, "RealtimeLoop", lambda: Part("pulse"))
+    monkeypatch.setattr(virtual_nodes, "ActuatorLines", lambda _app: Part("lines"))
+    monkeypatch.setattr(virtual_nodes, "_wrapped", lambda *_words: Part("reader"))
+    monkeypatch.setattr(virtual_nodes, "_boards", lambda *_words: "make")
+    monkeypatch.setattr(virtual_nodes, "_servers", lambda _app, _nodes, **_links: [Part("air"), Part("bus")])
+    monkeypatch.setattr(virtual_nodes, "_check_options", lambda *_words, **_links: None)
+    monkeypatch.setattr(
+        virtual_nodes, "_say_ready", lambda _app, _nodes, up, source: course.append(("ready", up, source))
+    )
+    monkeypatch.setattr(virtual_nodes.provisioning.meeting, "IdleStop", lambda _none: Stop())
+    names = ("SIGTERM", "SIGINT", "SIGUSR1", "SIGUSR2")
+    monkeypatch.setattr(
+        virtual_nodes,
+        "signal",
+        SimpleNamespace(
+            **{name: name for name in names}, signal=lambda name, handler: handlers.update({name: handler})
+        ),
+    )
+    folders = [tmp_path / "a", tmp_path / "b"]
+    uuids = [FlashFile.create(folder).load().uuid.hex() for folder in folders]
+    words: dict[str, Any] = dict.fromkeys(("nfc", "can", "ble"), None) | links
+    app: Any = SimpleNamespace(warn=None)
+    callback: Any = virtual_nodes.run.callback
+    ending = pytest.raises(LinkError) if fails else nullcontext()
+    with ending:
+        callback.__wrapped__(
+            app, folders=folders, crypto_delay=20.0, flash_delay=5.0, source="noise", battery=None, bus=None,
+            node_ids=(), **words,
+        )  # fmt: skip
+    begun = ["start pulse", "start reader", "start board", "start air", "start bus"]
+    ends = ["stop air", "stop board", "stop reader", "stop pulse"]
+    if fails:
+        assert course == [*begun, *ends], "what was started is stopped"
+    else:
+        up = [place for place in (words["nfc"], words["can"], words["ble"]) if place]
+        assert course == [*begun, ("ready", up, "noise"), "start lines", "stop bus", *ends, "stop lines"]
+    assert set(handlers) == set(names)
+    assert [folder for folder, _ in made] == folders
+    for (_, how), uuid in zip(made, uuids, strict=True):
+        assert (how["delays"].crypto, how["delays"].flash) == (0.02, 0.005), "milliseconds"
+        assert (how["has_can"], how["exclusive"], how["board"], how["located"]) == (
+            has_can,
+            True,
+            "make",
+            f"locate {uuid}",
+        )
