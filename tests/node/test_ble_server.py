@@ -5,6 +5,7 @@ The controller is a mock: what bumble does with a real one is in ``tests/links/b
 
 from __future__ import annotations
 
+import asyncio
 import sys
 import threading
 from collections.abc import Iterator
@@ -162,6 +163,27 @@ def test_a_controller_that_takes_no_data_is_a_fault_of_the_link(controller: Cont
     with pytest.raises(LinkError) as no:
         served.send_data(frame())
     assert no.value.message == "The Bluetooth controller takes no data."
+
+
+def test_what_a_controller_does_not_take_in_time_is_given_up(
+    controller: Controller, served: BleServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would leave later, behind messages that are newer."""
+    monkeypatch.setattr(server, "_SEND_SECONDS", 0.01)
+    served.start()
+    controller.wait(2)
+
+    async def stuck(_link: str, _data: bytes) -> None:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            controller.note("given up")
+            raise
+
+    monkeypatch.setattr(served._peripheral, "notify_data", stuck)
+    with pytest.raises(LinkError):
+        served.send_data(frame())
+    assert controller.wait(1)[-1][0] == "given up"
 
 
 def test_a_node_s_bluetooth_needs_bumble(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import UsageError
+from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.links.nfc.nfcpy import nfc
 from teds_provision.node.nfc import server as server_module
 from teds_provision.node.nfc.server import ETU, AirTime, NfcServer, answer_seconds, command_seconds
@@ -223,11 +223,15 @@ class Reader:
         return self.said.pop(0)
 
 
+places: list[Any] = []
+
+
 class Place:
     """A place on the reader that is free at the second look."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.asked, self.air = 0, None
+        places.append(self)
 
     def bind(self) -> bool:
         self.asked += 1
@@ -286,6 +290,58 @@ def test_the_node_learns_when_the_field_comes_and_goes(monkeypatch: pytest.Monke
     assert [answer.hex() if answer else answer for answer in reader.answers] == [
         "057880b000", "c2", None, None, "a3", "057880b000",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("bind", "message", "hint"),
+    [
+        (False, "Another node or program is using udp:localhost:5000.", "Stop it, or use another port."),
+        (OSError(98, "Address already in use"), "The node cannot use udp:localhost:5000: Address already in use.",
+         "Try another port."),
+    ],
+)  # fmt: skip
+def test_a_reader_that_another_node_is_on_is_refused(
+    monkeypatch: pytest.MonkeyPatch, bind: bool | Exception, message: str, hint: str
+) -> None:
+    def taken() -> bool:
+        if isinstance(bind, Exception):
+            raise bind
+        return bind
+
+    waits: list[float] = []
+    monkeypatch.setattr(server_module, "NodeDevice", lambda *_: SimpleNamespace(bind=taken, air=None))
+    now = [100.0]
+
+    def wait(seconds: float) -> bool:
+        waits.append(seconds)
+        now[0] += seconds
+        return False
+
+    monkeypatch.setattr(server_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(server_module, "_QUEUE", 0.25)
+    server = NfcServer("udp:localhost:5000", Handler())
+    server._stop = cast("Any", SimpleNamespace(wait=wait))
+    with pytest.raises(NoReaderError) as no:
+        server.start()
+    assert (no.value.message, no.value.hint) == (message, hint)
+    assert waits == ([] if isinstance(bind, Exception) else [0.25] * 5), "a node that leaves has a second"
+    assert not server._thread.is_alive()
+
+
+@pytest.mark.parametrize("pace", [True, False])
+def test_frames_last_as_on_air_if_that_is_asked(monkeypatch: pytest.MonkeyPatch, pace: bool) -> None:
+    served(monkeypatch, None, uid=UID, pace=pace)
+    assert isinstance(places[-1].air, AirTime) is pace
+
+
+def test_a_restart_of_the_node_ends_its_sessions_and_forgets_its_replies() -> None:
+    handler = Handler()
+    server = NfcServer("udp:localhost:5000", handler)
+    server.restarted()
+    job = server._tnep._jobs.get()
+    assert job is not None
+    job()
+    assert handler.lost_lines == ["nfc"]
 
 
 def test_a_type_2_tag_answers_its_first_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,7 +129,13 @@ def test_a_reply_is_kept_for_20_seconds_from_its_end(monkeypatch: pytest.MonkeyP
     assert (tag._run(7, commit), ran) == (b"\2", [commit] * 2)
 
 
-def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk) -> None:
+@pytest.mark.parametrize("changes", [True, False], ids=["Identify changes", "Identify stays"])
+def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, changes: bool
+) -> None:
+    if not changes:  # so that the initial message, shown already, is not put once more
+        same = desk.handler.identify()
+        monkeypatch.setattr(desk.handler, "identify", lambda: same)
     desk.exchange(select())
     desk.handler.go.clear()
     desk.mailbox.write(request(Piece(1, 4, 0, b"abcd")))
@@ -142,6 +148,20 @@ def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk)
     assert desk.tag.ready(5)
     records = message.decode(desk.mailbox.read())
     assert tnep.external(records, tnep.ID_TYPE) == desk.handler.identify()
+
+
+def test_a_command_that_has_not_begun_is_not_run_once_the_field_is_gone() -> None:
+    handler = Handler()
+    tag = TnepTag(Type4Memory(500), handler, wt_int=4, n_wait=15)  # without its thread: the test runs its jobs
+    tag.activated()
+    tag._selected = True
+    tag._written(request(Piece(1, 4, 0, b"abcd")))
+    tag.lost()
+    while not tag._jobs.empty():
+        job = tag._jobs.get()
+        assert job is not None
+        job()
+    assert (handler.frames, handler.lost_lines) == ([], ["nfc"])
 
 
 def shown_id(desk: Desk) -> bytes | None:

@@ -514,6 +514,11 @@ def test_two_canopen_objects_of_one_name_and_a_factor_below_0(tmp_path: Path) ->
     assert canopen_device.read(path).channels[0].limits == (-100.0, 400.0)
 
 
+def test_an_event_timer_of_0_states_no_period(tmp_path: Path) -> None:
+    torque = canopen_device.read(edited(tmp_path, ("DefaultValue=500", "DefaultValue=0"))).channels[0]
+    assert (torque.period, "states no event timer for it, so 100 ms is assumed" in torque.note) == (0.1, True)
+
+
 @pytest.mark.parametrize(
     ("access", "mapping", "measured"),
     [("ro", 1, True), ("rwr", 1, True), ("rw", 1, False), ("rww", 1, False), ("wo", 1, False), ("ro", 0, False)],

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import LinkError, NoReaderError
 from teds_provision.links.can.sensor_bus import SensorFrame
 from teds_provision.node.wrapped import canopen_device, dbc_message, description, iio_reader, wrapped_source
 from teds_provision.node.wrapped.can_reader import CanReader
@@ -205,6 +206,84 @@ def test_objects_of_one_name_are_told_apart_by_their_parents_or_their_index() ->
 )
 def test_a_name_of_a_teds_has_120_octets_and_no_half_letter(name: str, cut: str) -> None:
     assert description._cut(name) == cut
+
+
+@pytest.mark.parametrize(
+    ("scans", "opens", "log"),
+    [
+        ((1, 1), True, ["open 2", "buffer"]),
+        ((1, 1), False, ["open 2", "files"]),
+        ((1, None), True, ["files"]),
+        ((None, 1), True, ["files"]),
+        ((None, None), True, ["files"]),
+    ],
+)
+def test_a_buffer_is_read_if_it_holds_every_channel(scans: tuple[int | None, ...], opens: bool, log: list[str]) -> None:
+    seen: list[str] = []
+
+    def open_buffer(channels: list[Any]) -> bool:
+        seen.append(f"open {len(channels)}")
+        return opens
+
+    made: Any = IioReader.__new__(IioReader)
+    made._parts = [(SimpleNamespace(scan=scan), None) for scan in scans]
+    made._open_buffer = open_buffer
+    made._poll, made._read_buffer = lambda: seen.append("files"), lambda: seen.append("buffer")
+    made.start()
+    made._thread.join()
+    assert seen == log
+
+
+class SensorsBus:
+    """Mock of a bus of sensors: whether it was closed."""
+
+    def __init__(self) -> None:
+        self.closed = 0
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_a_lost_bus_is_closed_and_tried_again_ever_later_until_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    troubles, said, waits, buses = list[str](), list[str](), list[float](), list[SensorsBus]()
+    reader: Any = SimpleNamespace(message=SimpleNamespace(key=FrameKey(0x100, False)), note_trouble=troubles.append)
+    made: Any = CanReader(cast("Any", None), [reader], said.append)
+    steps = [LinkError("Bus off."), None, *[NoReaderError("No such device.")] * 6, LinkError("Bus off.")]
+
+    def opened() -> SensorsBus:
+        if isinstance(steps[0], NoReaderError):
+            raise steps.pop(0)
+        buses.append(SensorsBus())
+        return buses[-1]
+
+    def read(bus: SensorsBus) -> None:
+        assert bus is buses[-1]
+        if (step := steps.pop(0)) is not None:
+            raise step
+
+    class Waits:
+        def is_set(self) -> bool:
+            return not steps
+
+        def wait(self, seconds: float) -> None:
+            waits.append(seconds)
+
+        def set(self) -> None:
+            steps.clear()
+
+    made._open, made._read, made._stop = opened, read, Waits()
+    made._run()
+    assert waits == [1, 1, 2, 4, 8, 16, 30, 30]
+    assert said[:2] == [
+        f"{why} The values of the wrapped sensors are invalid until the bus is back."
+        for why in ("Bus off.", "No such device.")
+    ]
+    assert troubles[:2] == ["Bus off", "No such device"]
+    assert [bus.closed for bus in buses] == [1, 1, 1]
+    made._bus = buses[0]
+    made.stop()
+    made.stop()
+    assert (buses[0].closed, made._bus) == (2, None)
 
 
 def test_what_was_enabled_last_is_disabled_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

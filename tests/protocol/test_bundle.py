@@ -253,6 +253,15 @@ def test_a_key_under_another_keys_id_is_not_authentic():
         opened(sealed(bent("nodes.0.key.kid", "00" * 8)))
 
 
+def test_the_first_node_that_cannot_be_taken_is_named_by_its_number():
+    for path, kind in (("nodes.1.key.kid", NotAuthenticError), ("nodes.1.epoch", BadDataError)):
+        members = bent(path, "00" * 8)
+        members["nodes"][0]["key"]["kid"] = members["nodes"][0]["key"]["kid"].upper()
+        with pytest.raises(kind) as no:
+            opened(sealed(members))
+        assert no.value.message.startswith("Node 2 of the bundle cannot be taken. ")
+
+
 @pytest.mark.parametrize(
     "payload",
     [b"", b"[]", b"null", b"{", b'{"a":1}x', b"\xff\xfe", b'{"format":NaN}', b"[" * 100_000, b'{"a":1,"a":1}'],

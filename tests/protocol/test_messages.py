@@ -115,6 +115,22 @@ def test_tagged_arguments_are_recognised_and_never_written():
     assert (write.school, write.get("octets")) == ("tagged", b"\x03\x04")
 
 
+@pytest.mark.parametrize(
+    ("sections", "school"),
+    [
+        ("01000103" + "03000400000007", "tagged"),
+        ("01000103" + "03000400000007" + "010001ff", "concatenated"),  # one more than a Read has
+        ("01000103", "concatenated"),
+        ("01000103" + "0300040000000700", "concatenated"),
+        ("01000103" + "030004000000", "concatenated"),
+        ("02000103" + "03000400000007", "concatenated"),  # a u16 of one octet
+    ],
+)
+def test_a_payload_is_tagged_if_its_sections_are_those_of_the_layout(sections, school):
+    octets = bytes.fromhex(sections)
+    assert decode_message(bytes.fromhex("00010102") + len(octets).to_bytes(2, "big") + octets).school == school
+
+
 def test_a_segment_that_only_begins_like_tagged_arguments_is_plain():
     octets = compose_command(1, 1, 3, {"access_code": 1, "offset": 0x00010C03, "octets": bytes(9)})
     assert decode_message(octets).get("offset") == 0x00010C03

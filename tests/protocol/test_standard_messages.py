@@ -172,8 +172,14 @@ def test_a_reply_has_failed_if_its_flag_is_0_alone(flag: int, ok: bool) -> None:
 @pytest.mark.parametrize("reply", ["", "01", "0100", "010000ff", "010001", "010002ff", "000001"])
 def test_a_reply_whose_length_does_not_count_its_octets_is_garbled(reply: str) -> None:
     assert decode_reply(bytes.fromhex("010000")).payload == b""
-    with pytest.raises(GarbledError):
-        decode_reply(bytes.fromhex(reply))
+    octets = bytes.fromhex(reply)
+    with pytest.raises(GarbledError) as no:
+        decode_reply(octets)
+    assert no.value.message == (
+        f"A reply frame has at least 3 octets, this one {len(octets)}."
+        if len(octets) < 3
+        else f"A reply frame announces {int(reply[2:6], 16)} octets and carries {len(octets) - 3}."
+    )
 
 
 def test_a_query_reply_has_twelve_octets_in_the_order_of_the_standard() -> None:

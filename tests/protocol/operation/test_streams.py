@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -15,6 +17,7 @@ from teds_provision.protocol.operation.stream_commands import (
     StreamKind,
     stop,
 )
+from teds_provision.protocol.operation.stream_role import StreamRole
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan, TickBounds
 
 from .bench import MS, SECOND, Bench
@@ -309,6 +312,17 @@ def test_a_stream_ends_with_a_claim_of_its_own_channels_in_its_own_session_alone
     assert came(250 * MS) == [True, False, False], "the other session's claim of the same sensor"
     assert bench.reason(stop(1)) == Reason.WRONG_STATE
     assert bench.send(stop(0)).ok
+
+
+@pytest.mark.parametrize(
+    ("due", "earliest"),
+    [((500, 300), 300), ((300, 500), 300), ((None, 300), 300), ((300, None), 300), ((None, None), None), ((0, 7), 0)],
+)
+def test_the_next_frame_is_the_earliest_of_every_bus(due: tuple[int | None, ...], earliest: int | None) -> None:
+    role: Any = StreamRole.__new__(StreamRole)
+    role._streams = [SimpleNamespace(port=SimpleNamespace(bus=bus)) for bus in ("can", "ble", "can")]
+    role._senders = {bus: SimpleNamespace(due=lambda _, at=at: at) for bus, at in zip(("can", "ble"), due, strict=True)}
+    assert role.next_frame() == earliest
 
 
 def test_the_node_wants_to_be_called_for_the_first_instant_of_all_its_streams() -> None:
