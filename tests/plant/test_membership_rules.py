@@ -221,8 +221,8 @@ def test_a_person_names_the_branch_by_its_hash_and_may_change_his_mind(
         assert station.plant.pages.chain(west).counted == (3, hashes[f"{home}3"])
         assert station.plant.pages.chain(west).accepted == (2, hash)
         entry = list(station.audit_log.entries())[-1]
-        assert (entry.act, entry.outcome, entry.detail) == (
-            "registry", "accepted", {"station": west, "n": 2, "hash": hash}
+        assert (entry.act, entry.uuid, entry.outcome, entry.detail) == (
+            "registry", None, "accepted", {"station": west, "n": 2, "hash": hash}
         )  # fmt: skip
     for digits in (hashes["a3"], "0" * 8):
         with pytest.raises(PolicyError, match="Page 2 of west exists here twice") as error:

@@ -482,12 +482,14 @@ def test_a_key_that_is_outdated_does_not_leave_with_a_copy_that_waits(plant: Pla
     sync(plant, "west")
     plant.transport.full = False
     happens(west, board)
+    [waiting] = west.plant.parcels.all("out", "ready")
     done = parcels.send_out(west, plant.transport, plant.views("west"), now())
     cause = f"keys for south, because of node {board.uuid.hex()}: {why}"
-    assert done.held_back == (f"1 parcel dropped: {cause}; a new copy has what may still go",)
-    assert [entry.outcome for entry in west.audit_log.entries() if entry.act == "export"][-2:] == [
-        "parcel dropped", "done"
-    ]  # fmt: skip
+    cause += "; a new copy has what may still go"
+    assert done.held_back == (f"1 parcel dropped: {cause}",)
+    dropped, exported = [entry for entry in west.audit_log.entries() if entry.act == "export"][-2:]
+    assert (dropped.uuid, dropped.outcome, exported.outcome) == (None, "parcel dropped", "done")
+    assert dropped.detail == {"parcel": waiting.id, "handover": waiting.about, "why": cause}
     listed = pending.list_handovers(west, now())
     assert sorted((one.row.state, one.expired) for one in listed) == [("dropped", False), ("open", False)]
     sync(plant, "south")
