@@ -10,13 +10,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import click
 import pytest
 
 from teds_provision.cli.config_file import Defaults, anchored, brokers_of, home_of, problems
-from teds_provision.cli.main import cli, run
+from teds_provision.cli.main import _read_config, cli, run
 from teds_provision.cli.station.config import _edited
 
 from .shell import call, clean_environment
@@ -448,3 +448,12 @@ def test_a_value_is_checked_as_its_own_command_takes_it(home: Path, monkeypatch:
     assert warned.json["settings"][1:] == [
         {"name": "bitrate", "value": "5", "source": "environment (TEDS_PROVISION_BITRATE)"}
     ]
+
+
+def test_a_command_reads_the_relative_paths_of_the_file_from_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text('trace = "frames.pcapng"\n[backup]\nto = "copy.tpbk"\n')
+    context = click.Context(click.Command("teds-provision"))
+    assert _read_config(context, cast(Any, None), tmp_path) == tmp_path
+    assert context.default_map is not None
+    assert context.default_map["trace"] == str(tmp_path / "frames.pcapng")
+    assert context.default_map["backup"]["to"] == str(tmp_path / "copy.tpbk")

@@ -214,6 +214,10 @@ def test_what_is_no_message_is_not_composed() -> None:
     with pytest.raises(BadDataError) as no:
         compose_service(1, 1, 9, {})
     assert no.value.message == "There is no network service 1.1 with message type 9."
+    with pytest.raises(BadDataError):
+        compose_command(1, 1, 1)  # only Open may come without arguments
+    assert compose_command(0, 128, 3) == bytes.fromhex("0000 8003 0000")
+    assert compose_command(65_535, 1, 1, {"access_code": 3})[:2] == b"\xff\xff"
     long: dict[str, Any] = {"access_code": 3, "offset": 0, "octets": bytes(65_530)}
     assert len(compose_command(1, 1, 3, long)) == 6 + 65_535
     with pytest.raises(BadDataError) as no:

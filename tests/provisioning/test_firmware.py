@@ -17,7 +17,7 @@ from teds_provision.doctor.checks import System
 from teds_provision.doctor.fleet import nodes
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NodeSilentError
 from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
-from teds_provision.protocol.messages.frames import Reason, Reply
+from teds_provision.protocol.messages.frames import Command, Reason, Reply
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 from teds_provision.provisioning import identify as identify_step
@@ -291,6 +291,25 @@ def test_a_plain_report_never_permits(station: Station, tmp_path: Path) -> None:
     board.report = GOOD
     done = given(station, board, profile(tmp_path, TABLE))
     assert done.verified.verdict == "authentic"
+
+
+def test_a_board_that_does_not_report_in_its_session_is_refused(station: Station, tmp_path: Path) -> None:
+    """Its plain report was good, but nobody vouches for that one; a board that is busy (17) is not signed either."""
+    board = FirmwareBoard(report=GOOD)
+    link = on_bus(board)
+    with met(board, link) as node:
+        asks = node.request_idempotent
+
+        def refused(command: Command, *words: Any, **more: Any) -> bytes:
+            if command == ABOUT and node.sealed:
+                raise NodeRefusedError("It is busy.", reason=Reason.BUSY)
+            return asks(command, *words, **more)
+
+        node.request_idempotent = refused  # type: ignore[method-assign]
+        order = BuildOrder(profile(tmp_path, TABLE))
+        with pytest.raises(FirmwareError, match="does not report its firmware"):
+            provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
+    assert board.state.state == NodeState.KEYED
 
 
 def test_a_type_without_the_table_asks_nothing_before_the_session(station: Station) -> None:

@@ -724,6 +724,8 @@ def test_what_the_laboratory_states_of_itself_is_in_its_contact() -> None:
         ("content", "Works"),
         ("content", "not stated"),
     ]
+    by_phone = written("0,0\n1,1\n", Laboratory(phone="+43 1 2"))
+    assert ("eMail" in by_phone, "<dcc:phone>+43 1 2<" in by_phone) == (False, True)
     plain = written("0,0\n1,1\n", Laboratory())
     assert ("eMail" in plain, "phone" in plain, "city" in plain, "<dcc:countryCode>ZZ<" in plain) == (False,) * 3 + (
         True,

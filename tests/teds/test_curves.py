@@ -35,6 +35,16 @@ def test_without_a_channel_teds_the_units_are_those_of_the_profile(tactile: Prof
     assert channel_of(1, {}, None).units != NEWTON.units
 
 
+def test_a_value_is_shown_in_the_unit_of_its_calibration_unless_that_is_only_a_formula() -> None:
+    degrees = replace(CHANNEL, units=parse_unit("K").units)
+    assert degrees.show(300.0, like=parse_unit("degC")) == "26.85 degC"
+    assert degrees.show(5.0, difference=True, like=parse_unit("degC")) == "5 degC"
+    formula = replace(parse_unit("mm"), text="(mm)")
+    assert replace(CHANNEL, units=formula.units).show(0.5, like=formula) == "0.5 m"
+    chosen = replace(CHANNEL, units=formula.units, display="cm")
+    assert chosen.show(0.5, like=parse_unit("mm")) == "50 cm", "what its profile shows counts first"
+
+
 def test_what_the_channel_teds_states_counts_before_the_profile(tactile: Profile) -> None:
     blocks = tactile.build(bytes(10)).blocks
     other = replace(tactile, channels=tuple(replace(c, unit=parse_unit("m")) for c in tactile.channels))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 
 from teds_provision import teds
 from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.codec.values import split_text
 
 META_HEAD = "0304 0001 0101"
 META = f"{META_HEAD} 040a 00000000000000000000 0a04 3f800000 0c04 3f800000 0d02 0001"
@@ -621,3 +625,22 @@ def test_the_last_of_a_kind_is_found_twice_wherever_the_first_stands() -> None:
     found = [(finding.code, finding.offset) for finding in teds.decode(octets).findings]
     assert found == [("order", 13), ("repeated", 16), ("repeated", 19)]
     assert teds.decode(octets).get("TCName") == "a", "the first counts"
+
+
+@pytest.mark.parametrize(
+    ("lengths", "area", "texts", "codes"),
+    [
+        ((), b"", (), []),
+        ((0,), b"", (), []),
+        ((1,), b"a", (b"a",), ["text-length"]),  # too short for its checksum
+        ((1, 3), b"abcd", (b"abcd",), ["text-length"]),
+        ((), b"ab", (b"ab",), ["text-length"]),
+    ],
+)
+def test_texts_that_the_directory_does_not_fit_stay_in_one_piece(
+    lengths: tuple[int, ...], area: bytes, texts: tuple[bytes, ...], codes: list[str]
+) -> None:
+    found: list[str] = []
+    entries = [SimpleNamespace(name="DirBlock", children=[SimpleNamespace(type=22, value=n)]) for n in lengths]
+    assert split_text(cast(Any, entries), area, 10, lambda _severity, code, *_rest: found.append(code)) == texts
+    assert found == codes

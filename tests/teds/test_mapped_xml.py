@@ -126,6 +126,18 @@ def test_what_is_wrong_is_named(xml: bytes, mapping: str, words: str) -> None:
         profile_from_xml(xml, mapping, name="lab")
 
 
+def test_a_dtd_is_refused_also_if_it_declares_nothing() -> None:
+    with pytest.raises(BadDataError, match="has a DTD or entities, which are not read") as refusal:
+        profile_from_xml(b"<!DOCTYPE d><d/>", MAP, name="lab")
+    assert refusal.value.hint == "Remove the DOCTYPE."
+
+
+@pytest.mark.parametrize("octets", [b"<d>", b'<?xml version="1.0" encoding="nowhere-8"?><d/>', b""])
+def test_what_is_no_xml_or_in_an_unknown_encoding_is_refused(octets: bytes) -> None:
+    with pytest.raises(BadDataError, match="is not XML"):
+        profile_from_xml(octets, MAP, name="lab")
+
+
 @pytest.mark.parametrize(
     "bomb",
     [

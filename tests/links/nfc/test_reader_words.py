@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import errno
+import sys
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.links.nfc import hints, reader
+from teds_provision.links.nfc import hints, nfcpy, reader
 from teds_provision.links.nfc.nfcpy import nfc
 from teds_provision.links.nfc.reader import Reader
 from teds_provision.links.nfc.tag import ReaderLostError
@@ -223,3 +225,14 @@ def test_what_a_node_that_can_be_charged_announces(payload: str, fields: dict[st
     assert {name: found[name] for name in fields if fields[name] is not None} == {
         name: value for name, value in fields.items() if value is not None
     }
+
+
+def test_loading_nfcpy_leaves_the_search_for_libraries_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if nfcpy cannot be imported; what other code searches then must be found."""
+    find = ctypes.util.find_library
+    nfcpy._load()
+    assert ctypes.util.find_library is find
+    monkeypatch.setitem(sys.modules, "nfc.tag.tt4", None)
+    with pytest.raises(ImportError):
+        nfcpy._load()
+    assert ctypes.util.find_library is find
