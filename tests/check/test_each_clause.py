@@ -18,6 +18,7 @@ from teds_provision.check import measuring_rules, plain_rules
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError
 from teds_provision.check.rule import Rule, RuleResult
 from teds_provision.check.run import _Run
+from teds_provision.errors import NotAuthenticError
 from teds_provision.protocol.messages.frames import Attribute, Command, Reply, TedsStatus
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
@@ -125,6 +126,8 @@ def _states_without(bit: int) -> Change:
 
 
 ROWS: list[Row] = [
+    ("refusal-form", "128.99", 1, bytes, "128.99: status 1 and 1 octets"),
+    ("stranger-ends-nothing", "128.4", 1, _xor(30, 1), "The tag of a sealed reply is wrong."),
     ("identify", "128.7", 1, _identity(uuid=bytes(10)), "the node was found as"),
     ("prove", "128.8", 1, _longer, "64 octets are due, 65 came"),
     ("list-ascending", "128.11", 1, _without_security, "leaves out the Security TEDS"),
@@ -185,6 +188,7 @@ ROWS: list[Row] = [
     ("drive-replay", "128.20", 1, _xor(3, 64), "are announced"),
     ("drive-replay", "128.16", 3, _at(30, b"\xff" * 4), "none had a good tag"),
     ("drive-replay", "128.16", 3, _at(30, bytes([0, 0, 0, 6])), "says 6"),
+    ("drive-replay", "128.16", 4, _at(30, bytes([0, 0, 0, 4])), "was taken after counter 7; Clock (128.16) says 4"),
     ("drive-replay", "128.19", -1, _states_without(32), "bit 5 is not set"),
     ("trigger-token", "128.16", 2, _at(16, bytes(8)), "gives no mark"),
     ("trigger-token", "128.16", 3, _xor(23, 1), "the mark went from"),
@@ -309,6 +313,8 @@ def _found(station: Station, patch: pytest.MonkeyPatch, rows: list[Row], over: s
                 rule.run(probe)
             except (RuleBrokenError, NotApplicableError) as broken:
                 found[row] = str(broken)
+            except NotAuthenticError as wrong:
+                found[row] = wrong.message
             bench.bent = ""
         if mine:
             restore(probe, after, later)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
-from teds_provision.check import agreement_rules, measuring_rules, plain_rules, write_rules
+from teds_provision.check import agreement_rules, measuring_rules, plain_rules, session_rules, write_rules
 from teds_provision.check.agreement_rules import StrangerStation
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError
 from teds_provision.check.run import _Run
@@ -17,6 +17,7 @@ from teds_provision.check.slips import Slip
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, verify
 from teds_provision.protocol.messages.frames import Command, Reply, TedsStatus
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.can_frames import DataAddress, cut
 from teds_provision.teds.sheet import ChannelKind
 
 from . import bends
@@ -392,3 +393,64 @@ def test_why_nothing_is_explained_is_kept(monkeypatch: pytest.MonkeyPatch, error
 def test_a_channel_of_an_unknown_form_has_no_octets() -> None:
     teds = measuring_rules.channel_teds(ChannelKind.SENSOR, 1, 2)
     assert measuring_rules._octets(teds) == 2
+
+
+def test_a_counter_that_was_used_a_lower_one_and_0_are_tried() -> None:
+    """profile.md, "Sessions": the counter ascends from 1; 13 for any other."""
+    sealed: list[tuple[int | None, int]] = []
+
+    def session() -> Any:
+        def seal(command: Command, *, counter: int | None = None) -> Command:
+            sealed.append((counter, command.function))
+            return Command(0, 128, 4, bytes([counter or 0]))
+
+        return SimpleNamespace(seal=seal, unseal=lambda _octets: None)
+
+    asked: list[int] = []
+
+    def plain(command: Command) -> Reply:
+        asked.append(command.payload[0])
+        return _refusal(13)
+
+    probe: Any = SimpleNamespace(
+        open=session, good=lambda command: b"", plain=plain, sealed_good=lambda command: asked.append(-1)
+    )
+    assert session_rules.sealed_counter(probe) == "13 for the same frame, for 8, 0, and for another command under 9"
+    assert sealed == [(9, 7), (8, 7), (0, 7), (9, 11), (0, 7)]
+    assert asked == [9, 8, 0, 9, -1, 0, -1], "the session stays open"
+
+
+def test_an_address_that_was_taken_twice_within_ten_seconds_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rule fails, and the rules after it still reach the board: at the address that it went back to."""
+    moves, addresses = list[int](), [17, 70]
+    monkeypatch.setattr(session_rules, "_free_address", lambda *_: 70)
+    monkeypatch.setattr(session_rules, "_moved", lambda *_: "session")
+    probe: Any = SimpleNamespace(
+        identity=lambda: Identity(UUID, NodeState.KEYED, 1, 0, 512, addresses.pop(0)), session="open", home_address=0,
+        sealed_good=lambda _command: b"", sealed=lambda _command: Reply(True, b""), move=moves.append,
+        contact=SimpleNamespace(link=object()),
+    )  # fmt: skip
+    with pytest.raises(RuleBrokenError, match="a second write within 10 s"):
+        session_rules.address_moves(probe)
+    assert (moves, probe.session, probe.home_address) == ([17], None, 17)
+
+
+@pytest.mark.parametrize("fd", [False, True])
+def test_of_the_frames_of_a_bus_those_of_the_stream_itself_make_its_messages(fd: bool) -> None:
+    """Another stream, another node, another station, and a frame that is none of data come between them."""
+    wanted, other = bytes(range(30)), bytes(range(100, 130))
+    queue: list[Any] = []
+    parts = list(zip(cut(wanted, fd=fd), cut(other, fd=fd), strict=True))
+    for _ in range(2):
+        for mine, foreign in parts:
+            for station, stream, node in ((0xF1, 2, 17), (0xF1, 1, 18), (0xF2, 1, 17)):
+                queue.append((DataAddress(station, stream, foreign.segment, node).identifier, foreign.data))
+            queue += [(0x18DA11F1, b"\x30\0\0"), (DataAddress(0xF1, 1, mine.segment, 17).identifier, mine.data)]
+    frames: Any = SimpleNamespace(
+        fd=fd, own=0xF1,
+        next=lambda _seconds: SimpleNamespace(**dict(zip(("identifier", "octets"), queue.pop(0), strict=True)))
+        if queue else None,
+    )  # fmt: skip
+    probe: Any = SimpleNamespace(now=lambda: 0.0, contact=SimpleNamespace(address=17))
+    asked: Any = SimpleNamespace(stream=1)
+    assert measuring_rules._messages(probe, frames, asked, 30, 3, 1.0) == [wanted, wanted]
