@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -26,7 +27,7 @@ from teds_provision.plant.commands.parcels import ParcelCarrier
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.roster import Member, Roster
 from teds_provision.station.station import Station
-from tests.bench import PASSPHRASE
+from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, call
 
 from .owner import ALL, REGISTRY, alone, join, member, roster_of
@@ -272,6 +273,52 @@ def test_pages_to_choose_the_last_one_from_are_shown_unless_it_is_given_or_retir
         assert "newest pages" not in call(home, "registry", "remove", "west", *words, "--dry-run").err
     pages.clear()
     assert "The newest pages of west:\n  none\n" in call(home, "registry", "remove", "west", "--lost").err
+
+
+def test_what_others_are_to_read_is_open_to_them(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A roster, a request and evidence are handed on: their files have what the umask leaves, no mode of a secret."""
+    (tmp_path / "stick").mkdir()
+    umask, made = os.umask(0o022), tmp_path / "made"
+    try:
+        with make_station(made, "first"):
+            pass
+        for where, *words in (
+            (made, "registry", "create", "--name", "plant", "--output", "created.jws", "--yes"),
+            (made, "registry", "request", "--output", "a.request"),
+            (home, "registry", "renew", "--days", 100, "--output", "renewed.jws", "--yes"),
+            (home, "registry", "role", "west", "base", "--draft", "roles.draft"),
+            (home, "registry", "sign", "roles.draft", "--output", "signed.jws", "--yes"),
+        ):
+            monkeypatch.chdir(tmp_path)
+            assert call(where, *words).code == 0, words
+        plant.sign_requests.FileOffice(tmp_path / "sign.request").request_signature(
+            cast("Any", SimpleNamespace(octets=b""))
+        )
+        plant.evidence._new_file(tmp_path, NODE, 1, set(), b"evidence")
+        plant.folder_transport.FolderTransport(tmp_path / "stick").post_roster(7, "ab" * 32, b"roster")
+    finally:
+        os.umask(umask)
+    modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir() if path.is_file()}
+    assert modes == dict.fromkeys(
+        ["created.jws", "a.request", "renewed.jws", "roles.draft", "signed.jws", "sign.request", f"{NODE}.1.json"],
+        0o644,
+    )
+    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "stick").rglob("*") if path.is_file()} == {0o644}
+
+
+def test_a_plan_of_an_export_writes_no_evidence(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = list[bool]()
+
+    def export(_station: Station, _rows: object, folder: Path, *, write: bool) -> dict[Path, bool]:
+        written.append(write)
+        return {folder / "one": True, folder / "two": False, folder / "three": True}
+
+    monkeypatch.setattr(plant.evidence, "export", export)
+    words, counts = ("evidence", "export", tmp_path), {"folder": str(tmp_path), "files": 3, "written": 2}
+    assert call(home, *words, "--dry-run").out == f"Would write 2 of 3 files to {tmp_path}.\n"
+    assert call(home, *words).out == f"Wrote 2 of 3 files to {tmp_path}.\n"
+    assert [call(home, "--json", *words, *more).json for more in ([], ["--dry-run"])] == [counts] * 2
+    assert written == [False, True, True, False]
 
 
 def test_who_resumes_is_warned_of_a_copy_and_asked(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -281,7 +281,8 @@ def test_a_draft_is_signed_over_a_file_or_a_transport_and_kept(
         return stub(image=signed)
 
     monkeypatch.setattr(sign_requests, "find_job", lambda *_: job)
-    monkeypatch.setattr(sign_requests, "at_node", lambda *_, **__: Visit())
+    opened = list[Any]()
+    monkeypatch.setattr(sign_requests, "at_node", lambda *given, unlock: opened.append((given[2], unlock)) or Visit())
     monkeypatch.setattr(sign_requests, "require_session", lambda _station, node: closed.append(f"session of {node}"))
     monkeypatch.setattr(sign_requests, "read_identity", lambda _: stub(epoch=3, sequence=9))
     monkeypatch.setattr(sign_requests, "own_name", lambda *_: "cell 1")
@@ -305,6 +306,7 @@ def test_a_draft_is_signed_over_a_file_or_a_transport_and_kept(
     assert isinstance(ways[1], RemoteOffice)
     assert ways[1].timeout == 2.5
     assert closed == ["session of node", "node", "session of node", "node", "transport"]
+    assert opened == [(NODE, "always")] * 2, "the request is signed with the station's key"
     order = OfficeOrder(NODE.hex(), "owner", "0b5f", tmp_path / "large.csv", tmp_path / "stick", None)
     with pytest.raises(BadDataError):
         sign_requests.sign_by_office(station, cast("Any", stub(timeout=2.5)), order, cast("Any", None))

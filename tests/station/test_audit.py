@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreError
+from teds_provision.station.store import audit
 from teds_provision.station.store.store import Store
 
 NODE = bytes(range(10))
@@ -170,3 +171,21 @@ def test_a_closed_store_says_so(store: Store) -> None:
     store.close()
     with pytest.raises(StoreError):
         store.audit.append("write", NODE, "done")
+
+
+@pytest.mark.parametrize("error", [KeyError("uid not found"), OSError("No entry"), ImportError("pwd"), None])
+@pytest.mark.parametrize("owners", [True, False])
+def test_an_entry_names_the_user_by_number_where_there_is_no_name(
+    monkeypatch: pytest.MonkeyPatch, error: Exception | None, owners: bool
+) -> None:
+    def user() -> str:
+        if error is not None:
+            raise error
+        return "me"
+
+    monkeypatch.setattr(audit.getpass, "getuser", user)
+    monkeypatch.setattr(audit.os, "getuid", lambda: 1234)
+    monkeypatch.setattr(audit, "HAS_OWNERS", owners)
+    monkeypatch.setattr(audit, "name_of_machine", lambda: "bench")
+    named = "me" if error is None else "uid 1234" if owners else "unknown"
+    assert audit._who.__wrapped__() == f"{named}@bench"

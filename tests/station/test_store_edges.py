@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
@@ -17,6 +18,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import BadDataError, NodeBusyError, StoreError, StoreLockedError
+from teds_provision.station import snapshot
 from teds_provision.station.station import Station
 from teds_provision.station.store import connection, database, dump, lock, row_sample
 from teds_provision.station.store.audit import _linked
@@ -226,6 +228,28 @@ def test_what_cannot_be_read_of_a_store_or_its_copy_is_closed_again(
         Database._opened(store.path, create=False)
     assert failure.value.hint == "Run teds-provision doctor."
     assert isinstance(failure.value.__cause__, sqlite3.OperationalError)
+
+
+@pytest.mark.parametrize("error", [sqlite3.OperationalError("disk I/O error"), OSError(errno.ENOSPC, "full")])
+def test_a_copy_that_cannot_be_put_in_place_leaves_no_store(store: Store, tmp_path: Path, error: Exception) -> None:
+    def backup(target: sqlite3.Connection) -> None:
+        target.execute("CREATE TABLE half(done)")
+        raise error
+
+    there = SimpleNamespace(
+        _lock=store._lock, _translated=contextlib.nullcontext, _connection=SimpleNamespace(backup=backup)
+    )
+    (tmp_path / "new").mkdir()
+    with pytest.raises(StoreError) as failure:
+        snapshot.place(cast("Any", SimpleNamespace(_store=there)), tmp_path / "new")
+    assert failure.value.message.startswith(f"The store {tmp_path / 'new' / 'store.sqlite3'} cannot be used: ")
+    assert failure.value.__cause__ is error
+    assert list((tmp_path / "new").iterdir()) == []
+    with pytest.raises(StoreError) as failure:
+        snapshot.place(cast("Any", None), store.home)
+    assert (failure.value.message, failure.value.hint) == (
+        f"There is a store in {store.home} already.", "Restore into another --home."
+    )  # fmt: skip
 
 
 def test_a_home_that_cannot_be_opened_is_a_store_failure_with_its_cure(
