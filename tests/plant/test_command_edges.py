@@ -396,6 +396,17 @@ def test_a_way_is_named_once(home: Path, words: tuple[str, ...], message: str, m
     assert message in done.err
 
 
+@pytest.mark.parametrize("story", ["--plant", "--line"])
+def test_a_story_has_no_address_to_serve_on(home: Path, story: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(of_demo.signal, "signal", lambda *_: None)
+    for module, name in ((plant.demo.plant, "run_plant_demo"), (plant.demo.line, "run_line")):
+        monkeypatch.setattr(module, name, lambda *_: pytest.fail("it was played"))
+    refused(
+        call(home, "demo", story, "--http", "127.0.0.1:1"), 2, "--http requires --page.",
+        "Run: teds-provision demo --page --http 127.0.0.1:8351",
+    )  # fmt: skip
+
+
 def test_a_copy_is_sent_under_a_roster_that_holds_and_a_move_whenever(
     home: Path, roster: Roster, monkeypatch: pytest.MonkeyPatch
 ) -> None:

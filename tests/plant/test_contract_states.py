@@ -223,6 +223,8 @@ def test_each_station_has_its_state_and_age(station: Station, monkeypatch: pytes
     assert found.exit_code == 4
     assert replace(found, standings=found.standings[1:]).exit_code == 6, "this one was removed"
     assert parcels.silent_stations(station, now, moment) == {at["old"]}
+    paged(station, station.fingerprint, 3, created(week + 1))
+    assert parcels.silent_stations(station, now, moment) == {at["old"]}, "the other members"
 
 
 def test_heads_are_a_digest_of_the_newest_page_that_counts_of_every_chain(station: Station) -> None:

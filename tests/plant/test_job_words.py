@@ -335,6 +335,8 @@ def test_the_status_of_a_job_as_a_table(home: Path, monkeypatch: pytest.MonkeyPa
         "teds-provision job status abcd1111 DIR",
     ]
     assert json.loads(call(home, "--json", "job", "status", "abcd").out)["stations"][1]["name"] == "west"
+    parts[0].attempts = 0
+    assert "\nwest, east: nothing received yet" in call(home, "job", "status", "abcd").out, "this station knows its own"
 
 
 def test_a_job_takes_no_datasheet_of_another_base(home: Path) -> None:

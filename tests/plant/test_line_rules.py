@@ -206,7 +206,9 @@ def test_a_board_is_known_as_well_as_the_job_asks(owner: Station, wanted: str, e
 # -- how many ----------------------------------------------------------------------------------------------------------
 
 
-def test_each_board_gets_the_next_unit_once_and_its_station_no_more_than_its_allotment(owner: Station) -> None:
+def test_each_board_gets_the_next_unit_once_and_its_station_no_more_than_its_allotment(
+    owner: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = LineRun(owner, job(owner, count=5, stations={ME: 2, OTHER: 3}))
     first = allotted(run)
     assert first.row == UnitRow(run.job.id, A, 1, first.row.at, 1, 0)  # type: ignore[union-attr]
@@ -215,9 +217,12 @@ def test_each_board_gets_the_next_unit_once_and_its_station_no_more_than_its_all
     assert (allotted(run, B).row.unit, run.unit_to_json(B)) == (  # type: ignore[union-attr]
         2, {"job": run.job.id, "unit": 2, "of": 5, "attempt": 1}  # type: ignore[union-attr]
     )  # fmt: skip
-    with pytest.raises(PolicyError, match=r"All 2 units of the job .* for this station are assigned") as error:
-        allotted(run, C)
-    assert error.value.exit_code == 6
+    asked = list[bytes]()
+    with monkeypatch.context() as patch:
+        patch.setattr(LineUnit, "wait_for", lambda _unit, _job, uuid: asked.append(uuid))
+        with pytest.raises(PolicyError, match=r"All 2 units of the job .* for this station are assigned") as error:
+            allotted(run, C)
+    assert (error.value.exit_code, asked) == (6, []), "before anything is asked of the board"
     assert allotted(run, B).attempt == 2, "who has one keeps it"
     fresh = LineRun(owner, run.job)
     with pytest.raises(PolicyError, match="All 2 units"):
@@ -239,14 +244,18 @@ def test_a_job_with_a_list_has_a_unit_for_each_board_of_it_whatever_its_allotmen
         allotted(run, C)
 
 
-def test_a_rebuilt_home_gives_no_new_unit_before_it_knows_which_it_gave(owner: Station) -> None:
+def test_a_rebuilt_home_gives_no_new_unit_before_it_knows_which_it_gave(
+    owner: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = LineRun(owner, job(owner))
     allotted(run)
     owner.plant.begin_restored()
     fresh = LineRun(owner, run.job)
     assert allotted(fresh).attempt == 2, "of a board whose unit is known"
+    monkeypatch.setattr(LineUnit, "wait_for", lambda *_: pytest.fail("the board was asked"))
     with pytest.raises(PolicyError, match="restored from a backup") as error:
         fresh.allot_unit(cast("Conversation", SimpleNamespace(tapped=True)), board(B), PREPARED, None)
+    monkeypatch.undo()
     assert error.value.hint == "To get them: teds-provision registry sync"
     owner.plant.end_restored()
     assert allotted(LineRun(owner, run.job), B).row.unit == 2  # type: ignore[union-attr]
@@ -413,6 +422,7 @@ def test_a_calibration_is_the_very_file_that_the_job_names(tmp_path: Path, owner
     run = LineRun(owner, listed, calibrations=folder)
     with pytest.raises(NotFoundError, match=f"There is no file {A.hex()}"):
         run.order(board())
+    (folder / f"{A.hex()}.d").mkdir()
     (folder / f"{A.hex()}.csv").write_bytes(TABLE + b"\n")
     with pytest.raises(PolicyError, match="is not the one the job specifies"):
         run.order(board())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -183,6 +184,21 @@ def test_an_empty_page_is_written_only_if_asked_for_and_none_before_a_rebuilt_ho
     assert write_page(station, roster(station)) is None
     assert write_page(station, roster(station), empty=True) is None
     assert station.plant.unsent() == 1
+
+
+def test_a_note_of_a_restored_home_counts_only_as_this_station_wrote_it(station: Station) -> None:
+    station.unlock()
+    assert not station.plant.restored
+    station.plant.begin_restored()
+    record = station.plant.record()
+    assert record is not None
+    assert station.plant.restored
+    for change in ({"restored": "2020-01-01T00:00:00Z"}, {"restored_mac": bytes(16)}, {"restored_mac": None}):
+        station.plant.put_record(replace(record, **cast("Any", change)))
+        assert not station.plant.restored
+    station.plant.put_record(record)
+    station.plant.end_restored()
+    assert not station.plant.restored
 
 
 def test_a_page_names_the_heads_that_changed_since_the_last_one_and_the_audit_log(station: Station) -> None:

@@ -15,6 +15,7 @@ from teds_provision.errors import StoreError
 from teds_provision.handover.incoming import ImportPlan
 from teds_provision.handover.pending import BundleNotes
 from teds_provision.plant.parcels import (
+    _BY_SHARE,
     _delete,
     _due,
     _expire,
@@ -23,6 +24,7 @@ from teds_provision.plant.parcels import (
     _note_refused,
     _put_out,
     _Reader,
+    _why_held_back,
     import_parcel,
     waiting_out,
 )
@@ -273,6 +275,40 @@ def test_a_bundle_that_was_imported_leaves_with_its_receipt_for_its_sender_or_st
     assert parcels.get("came", "in") is None
     [out] = parcels.all("out", "ready")
     assert (out.kind, out.peer, out.about, parcels.document(out.id, "out")) == ("receipt", WEST, "a bundle", b"receipt")
+
+
+@pytest.mark.parametrize(
+    ("peer", "mode", "by_share", "after", "shares", "why"),
+    [
+        (SOUTH, "copy", True, -SECOND, True, ""),
+        (SOUTH, "copy", False, -SECOND, False, ""),
+        (SOUTH, "copy", True, -SECOND, False, "keys for south, as no share of the roster sends them there any more"),
+        (SOUTH, "copy", True, timedelta(0), True,
+         "keys for south, as the roster expired on 2026-03-31; ask its owner: registry renew"),
+        (SOUTH, "move", False, timedelta(0), False, ""),
+        (SOUTH, "none", False, timedelta(0), False, ""),
+        ("gone", "move", False, -SECOND, True,
+         "gone is no member any more; to take back a move to it: handover undo ID"),
+    ],
+)  # fmt: skip
+def test_a_copy_leaves_under_a_roster_that_holds_and_shares_it_and_a_move_by_its_operator(
+    station: Station, monkeypatch: pytest.MonkeyPatch, peer: str, mode: Any, by_share: bool, after: timedelta,
+    shares: bool, why: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("teds_provision.plant.parcels.outgoing.why_outdated", lambda *_: None)
+    monkeypatch.setattr(
+        "teds_provision.plant.parcels.sharing.receivers", lambda _roster, _me, share: {SOUTH} if share else set()
+    )
+    ends = datetime(2026, 3, 31, tzinfo=UTC)
+    now = SimpleNamespace(
+        name_of={SOUTH: "south", "gone": "gone"}.__getitem__, member=lambda who: who if who == SOUTH else None,
+        expires=ends, share=[False, shares],
+    )  # fmt: skip
+    if mode != "none":
+        notes = BundleNotes((A.hex(),), "content", "ca", "2026-03-08T12:00:00Z").to_json()
+        station.handovers.put(Handover("about", "out", mode, (peer,), "open", notes))
+    row = ParcelRow("p", "out", peer, "bundle", "ready", "", "about", _BY_SHARE if by_share else "")
+    assert _why_held_back(station, cast("Any", now), row, ends + after) == why
 
 
 def test_a_receipt_waits_seven_days_and_a_bundle_until_it_expires(station: Station) -> None:

@@ -1178,6 +1178,29 @@ def test_own_pages_are_taken_from_who_handed_in_none_that_is_false(
     assert returned.own_pages(station, None, cast("Any", None), (), always=True) == []
 
 
+def test_what_both_sides_have_of_others_is_new_if_any_part_of_it_is() -> None:
+    """By roster, by who may hand in, by the database's state of each, and by every page that is here."""
+
+    def digest(
+        roster: str = "R", takes: bool = True, states: tuple[str, ...] = ("1", "2"), pages: tuple[str, ...] = ("a", "b")
+    ) -> str:
+        by_name = dict(zip((WEST, "dd" * 32), states, strict=True))
+        chains = {"dd" * 32: stub(id=1)}
+        links = [(n, hash, "") for n, hash in enumerate(pages)]
+        station = stub(plant=stub(pages=stub(chains=lambda: chains, chain_links=lambda _: links)))
+        database: Any = stub(state=by_name.get, takes_pages=takes)
+        return returned._digest(station, database, cast("Any", stub(by_key=by_name, hash=roster)))
+
+    other: list[dict[str, Any]] = [
+        {}, {"roster": "S"}, {"takes": False}, {"states": ("1", "3")}, {"states": ("", "2")}, {"pages": ("a", "c")},
+        {"pages": ("a",)}, {"pages": ("c", "b")},
+    ]  # fmt: skip
+    found = [digest(**changes) for changes in other]
+    assert digest() == found[0]
+    assert len(set(found)) == len(other)
+    assert digest(states=("", "")) == ""
+
+
 def test_who_is_in_no_roster_joins_none(station: Station) -> None:
     held = station.plant.roster
     assert held is not None
@@ -1188,7 +1211,9 @@ def test_who_is_in_no_roster_joins_none(station: Station) -> None:
         "Send its owner a request (registry request --output FILE); the owner then runs: registry add FILE --role …",
     )
     events = [("closed", None, {"job": "11111111-2222-4333-8444-555555555555"})]
+    assert not station.row_macs.active
     assert owner.join(station, held, url="file:/stick", events=cast("Any", events)) == 1
+    assert station.row_macs.active, "what is kept of the roster is kept with its MAC"
     record = station.plant.joined
     assert record is not None
     assert (record.url, len(station.plant.outbox(9))) == ("file:/stick", 1)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NotWhitelistedError, PolicyError, UsageError
+from teds_provision.errors import NotWhitelistedError, PolicyError, UsageError, VaultLockedError
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster
 from teds_provision.station.plant.plant import PlantConflictError
@@ -122,6 +122,40 @@ def test_trust_that_another_program_changed_is_reported_and_does_not_count(
     assert names(station.policy.trusted()) == [("south", "station")]
     assert [record.name for record in station.policy.listed()] == sorted([name, "south"])
     assert [row[0] for row in station.policy.mac_rows()] == [f"trust in {each}" for each in sorted([name, "south"])]
+
+
+def test_whom_a_station_believes_changes_only_with_an_open_vault(
+    station: Station, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row without a MAC of its own would count for nothing once the vault is open, or for too much."""
+    policy, pins = station.policy, station.pins
+    policy.trust(trusted("north", NORTH))
+    pins.put(WhitelistEntry(A, fingerprint(WEST), AT, "tap", "elbow"))
+    policy.deny(RevocationRecord(B, None, "stolen", "a.signed.ban", AT))
+
+    def rows() -> list[list[tuple[Any, ...]]]:
+        tables = ("trust", "whitelist", "revocations", "lifted", "ended_cas", "outbox", "station")
+        return [store.execute(f"SELECT * FROM {table}") for table in tables]
+
+    def closed() -> Any:
+        raise VaultLockedError("The vault is locked.")
+
+    before = rows()
+    for change in (
+        lambda: policy.trust(trusted("south", SOUTH)),
+        lambda: policy.distrust("north"),
+        lambda: policy.lift(B),
+        lambda: pins.put(WhitelistEntry(B, fingerprint(WEST), AT, "tap", None)),
+        lambda: pins.remove(A),
+        lambda: pins.unpin(A),
+        lambda: station.identity.complete(WEST, NORTH, bytes(64)),
+    ):
+        monkeypatch.setattr(station.row_macs, "_vault", closed)
+        with pytest.raises(VaultLockedError):
+            change()
+        monkeypatch.undo()
+    assert rows() == before
+    assert policy.lift(A) is False, "without a ban nothing is to be decided"
 
 
 def test_every_trusted_key_that_another_program_changed_is_named_up_to_five(

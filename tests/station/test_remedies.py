@@ -115,6 +115,17 @@ def test_a_name_or_frame_of_a_measured_node_stays_and_no_two_channels_have_one_n
     kept.rename(NODE, 1, "right")
     kept.rename(OTHER, 2, "left")
     assert put == [(NODE, 1, "right"), (OTHER, 2, "left")]
+    put.clear()
+    running[0], kept._remove_frame, kept._remove_name = True, kept._put_frame, kept._put_name
+    refused(
+        lambda: kept.set_frame(NODE, 1, "wrist"), FrozenError,
+        f"Node {NODE.hex()} is being measured, so its frames cannot be changed now.", end,
+    )  # fmt: skip
+    running[0] = False
+    for frame in ("wrist", "", None):
+        kept.set_frame(NODE, 1, frame)
+    kept.rename(NODE, 1, None)
+    assert put == [(NODE, 1, "wrist"), (NODE, 1, ""), (NODE, 1), (NODE, 1)], "only None is the profile's"
 
 
 def test_a_measurement_names_its_nodes_in_one_way(store: Store) -> None:
@@ -232,6 +243,13 @@ def test_a_label_is_of_a_known_key_and_an_image() -> None:
             lambda: label.write_label(stub(), Path(name)), UsageError,  # noqa: B023
             f"Labels are written as .svg or .png, not {name}.", "Name it LABEL.svg.",
         )  # fmt: skip
+
+
+def test_beside_the_code_of_a_label_stand_its_name_and_all_digits_16_in_a_line() -> None:
+    digits = "".join(f"{number:x}" * 16 for number in range(4))
+    lines = [NODE.hex(), "0" * 16, "1" * 16, "2" * 16, "3" * 16]
+    assert label.Label(NODE, digits, None).lines == label.Label(NODE, digits, "").lines == lines
+    assert label.Label(NODE, digits, "elbow").lines == ["elbow", *lines]
 
 
 def test_a_certificate_comes_from_the_station_with_the_ca_key() -> None:
