@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from teds_provision.errors import LinkError
+from teds_provision.errors import LinkError, NoReaderError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import Pair, physical_id, single
 from teds_provision.links.can.spec import parse_spec
@@ -51,6 +51,30 @@ def test_a_node_comes_back_from_bus_off_after_a_second_and_waits_twice_as_long_w
     monkeypatch.setattr(server_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     server._serve(nullcontext())  # type: ignore[arg-type]
     assert waits == [1, 2, 4, 8, 16, 30, 1, 2]
+
+
+def test_a_bus_that_does_not_open_again_is_tried_until_it_does(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    server, closed, announced = CanServer(hub.spec), list[str](), list[str]()
+    tries = [LinkError("bus-off"), NoReaderError("can0 is gone"), SimpleNamespace(close=lambda: closed.append("new"))]
+
+    def opened(_spec: object) -> object:
+        found = tries.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    waits: list[float] = []
+
+    def wait(seconds: float) -> bool:
+        waits.append(seconds)
+        return False
+
+    monkeypatch.setattr(server_module, "Bus", opened)
+    monkeypatch.setattr(server, "_bus", SimpleNamespace(close=lambda: closed.append("old")))
+    monkeypatch.setattr(server, "_stop", SimpleNamespace(wait=wait))
+    monkeypatch.setattr(server, "_addresses", SimpleNamespace(announce_all=lambda: announced.append("all")))
+    server._reopen(2.0)
+    assert (waits, closed, announced, tries) == ([2.0] * 3, ["old"], ["all"], [])
 
 
 class RawStation:

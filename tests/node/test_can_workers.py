@@ -82,6 +82,17 @@ def test_a_job_that_fails_costs_no_thread_and_no_line(caplog: pytest.LogCaptureF
     assert "A node's command failed." in caplog.text
 
 
+def test_a_job_of_no_line_that_fails_leaves_its_thread_to_the_next(caplog: pytest.LogCaptureFixture) -> None:
+    workers, ran = WorkerPool(1), threading.Event()
+    workers.run(lambda: {}[0])
+    workers.run(ran.set)
+    assert ran.wait(_SECONDS)
+    workers.end()
+    assert caplog.messages == ["A node's command failed."]
+    workers.run(ran.clear)
+    assert (workers._threads, workers._work.empty()) == ([], True), "after the end nothing happens"
+
+
 def test_the_end_waits_for_what_runs_and_drops_the_rest() -> None:
     workers, began, go = WorkerPool(1), threading.Event(), threading.Event()
     ended: list[str] = []

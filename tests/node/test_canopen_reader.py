@@ -225,8 +225,13 @@ class _Player(SimpleNamespace):
 
 def player(name: str, answers: Iterator[bool], polled: float, log: list[str]) -> Any:
     """Return a device that answers or not."""
+
+    def prepare() -> bool:
+        log.append(f"{name} prepare")
+        return next(answers)
+
     return _Player(
-        prepare=lambda: log.append(f"{name} prepare") or next(answers),
+        prepare=prepare,
         poll=lambda: log.append(f"{name} poll"),
         polled=polled,
         note_trouble=lambda reason: log.append(f"{name} {reason}"),

@@ -6,6 +6,9 @@ import threading
 import time
 from collections.abc import Callable
 
+import pytest
+
+from teds_provision.errors import LinkError
 from teds_provision.node.realtime_loop import RealtimeLoop
 
 
@@ -77,3 +80,29 @@ def test_a_wake_during_a_beat_is_not_lost() -> None:
         assert again.wait(60)
     finally:
         pulse.stop()
+
+
+@pytest.mark.parametrize(
+    ("failure", "logged"), [(LinkError("The bus is lost."), []), (ValueError("x"), ["A node's measuring failed."])]
+)
+def test_a_node_that_fails_rests_until_it_is_woken(
+    failure: Exception, logged: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A lost bus is the matter of the thread that reads it."""
+    pulse, beats = RealtimeLoop(), list[str]()
+
+    class Failing:
+        def beat(self) -> float | None:
+            beats.append("beat")
+            raise failure
+
+    class Last:
+        def beat(self) -> float | None:
+            pulse.stop()
+            return None
+
+    pulse.wake(Failing())
+    pulse.wake(Last())
+    pulse._run()
+    assert (beats, caplog.messages) == (["beat"], logged)
+    assert pulse._due == {}

@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import os
+import socket
 import stat
 import subprocess
 from pathlib import Path
@@ -16,12 +17,15 @@ import pytest
 
 from teds_provision.errors import NodeSilentError, StoreError, UsageError
 from teds_provision.node import flash_file
+from teds_provision.node.ble import address as ble_address
+from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
 from teds_provision.node.firmware import boot_loader
 from teds_provision.node.firmware.boot_loader import ImageSlots
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.sources import command, lines
-from teds_provision.node.virtual import VirtualNode
+from teds_provision.node.virtual import VirtualNode, _SlowKey
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import IDENTIFY
 
 
@@ -182,6 +186,92 @@ def test_a_program_that_does_not_end_in_two_seconds_is_killed() -> None:
     alone: Any = SimpleNamespace(_process=None, _stopped=False)
     command.CommandSource.stop(alone)
     assert alone._stopped is True
+
+
+class Slots:
+    """Images of a board: how the one that starts behaves, and what was done to them."""
+
+    running = None
+
+    def __init__(self, *behaviour: str, on_trial: bool) -> None:
+        self.behaviour, self.on_trial, self.done = behaviour, on_trial, list[str]()
+
+    def behaves(self, how: str) -> bool:
+        return how in self.behaviour
+
+    def start(self) -> None:
+        if self.done:
+            self.on_trial = False  # the boot loader reverts it
+        self.done.append("start")
+
+    def confirm(self) -> None:
+        self.on_trial = False
+        self.done.append("confirm")
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "on_trial", "done", "silent"),
+    [
+        ((), False, ["start"], False),
+        (("crash",), True, ["start", "start"], False),
+        (("crash",), False, ["start"], False),  # there is no image to go back to
+        (("confirm",), True, ["start", "confirm"], False),
+        (("mute",), False, ["start"], True),
+    ],
+)
+def test_how_an_image_behaves_at_its_start(
+    node: VirtualNode, behaviour: tuple[str, ...], on_trial: bool, done: list[str], silent: bool
+) -> None:
+    slots: Any = Slots(*behaviour, on_trial=on_trial)
+    node._slots = slots
+    node._start()
+    assert (slots.done, node._off) == (done, silent)
+
+
+def test_a_slow_chip_works_for_each_use_of_its_key() -> None:
+    work, key = list[str](), SoftwareKey(77)
+    slow = _SlowKey(key, lambda: work.append("work"))
+    assert slow.point == key.point
+    assert work == []
+    assert slow.sign(b"message") == key.sign(b"message")
+    assert slow.sign_digest(bytes(32)) == key.sign_digest(bytes(32))
+    assert slow.ecdh(SoftwareKey(78).point) == key.ecdh(SoftwareKey(78).point)
+    assert work == ["work"] * 3
+
+
+def test_a_node_whose_lock_cannot_be_had_is_named(tmp_path: Path) -> None:
+    FlashFile.create(tmp_path / "node")
+    (tmp_path / "node" / "lock").mkdir()
+    with pytest.raises(StoreError) as no:
+        FlashFile(tmp_path / "node", exclusive=True)
+    assert no.value.message == f"The folder {tmp_path / 'node'} cannot be used: Is a directory."
+
+
+def test_an_address_of_ble_that_cannot_be_kept_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ble_address, "whole_file", full)
+    with pytest.raises(StoreError, match=r"cannot be written: No space left on device\.$"):
+        StaticAddress(tmp_path, factory=True)
+
+
+def test_a_simulation_whose_connection_breaks_has_ended() -> None:
+    class Broken:
+        def recv(self, _most: int) -> bytes:
+            raise ConnectionResetError
+
+        def fileno(self) -> int:
+            return near.fileno()
+
+    near, far = socket.socketpair()
+    source = lines.UnixSocket([], print, Path("/nowhere"))
+    with near, far:
+        far.send(b"x")
+        assert source._receive(Broken()) == b""  # type: ignore[arg-type]
+        assert source._receive(near) == b"x"
+        source._stop.set()
+        assert source._receive(near) == b""
 
 
 # -- flash and slots ---------------------------------------------------------------------------------------------------

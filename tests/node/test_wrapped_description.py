@@ -58,6 +58,8 @@ U, F64 = "unsigned", SampleChoice("float64", 8, 64, False)
         (replace(COUNT, bits=23, scale=0.3), SampleChoice(U, 3, 23, True, 0, (0.0, 0.3)), None, None, None),
         (replace(COUNT, scale=1e-3, offset=1e6 + 0.03), F64, None, None, None),
         (replace(COUNT, scale=1e-46, offset=1.0), F64, None, None, None),
+        (replace(COUNT, scale=1e39), F64, None, None, None),
+        (replace(COUNT, offset=-1e39), F64, None, None, None),
         (replace(COUNT, low=5.0, high=5.0), SampleChoice(U, 2, 8, True), (0.0, 255.0), None, None),
         (replace(COUNT, low=5.0), SampleChoice(U, 2, 8, True), (0.0, 255.0), None, None),
         (replace(COUNT, low=4.5, high=9.5), SampleChoice(U, 2, 8, True), (4.5, 9.5), (5, 9), None),

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import LinkError, NoReaderError
+from teds_provision.errors import BadDataError, LinkError, NoReaderError, NotFoundError
 from teds_provision.links.can.sensor_bus import SensorFrame
 from teds_provision.node.wrapped import canopen_device, dbc_message, description, iio_reader, wrapped_source
 from teds_provision.node.wrapped.can_reader import CanReader
@@ -157,6 +158,60 @@ def test_signals_of_another_selector_do_not_lengthen_the_turn() -> None:
     assert [dbc_message._turns(message, signal) for signal in signals] == [3, 3, 5, 1]
 
 
+def test_a_signal_whose_scaling_is_not_linear_is_measured_as_a_raw_number() -> None:
+    signal: Any = SimpleNamespace(
+        name="oil", unit="degC", minimum=-40, maximum=125, scale=0.5, offset=-8, length=8, is_signed=False,
+        is_float=False, choices=None, comment="two\n words", multiplexer_ids=None, conversion=SimpleNamespace(),
+    )  # fmt: skip
+    message: Any = SimpleNamespace(name="Engine", is_multiplexed=lambda: False)
+    channel = dbc_message._channel(message, signal, 0.1)
+    assert (channel.unit, channel.scale, channel.offset, channel.low, channel.high) == ("count", 1.0, 0.0, None, None)
+    assert (channel.note, channel.comment) == (
+        "its scaling is not linear, so it is measured as a raw number", "two words"
+    )  # fmt: skip
+    signal.conversion = SimpleNamespace(scale=0.5, offset=-8)
+    channel = dbc_message._channel(message, signal, 0.0)
+    assert (channel.unit, channel.scale, channel.offset, channel.low, channel.high) == ("degC", 0.5, -8.0, -40, 125)
+    assert channel.note == ("the file states no cycle time of Engine, so 100 ms is assumed (GenMsgCycleTime)")
+
+
+def test_a_frame_of_a_message_in_messages_has_no_numbers() -> None:
+    decoded: list[Any] = [[("inner", {})], {"torque": 7, "state": "text"}]
+    message: Any = SimpleNamespace(name="Outer", decode=lambda *_, **__: decoded.pop(0))
+    made = dbc_message.DbcMessage(cast("Any", None), message)
+    with pytest.raises(BadDataError) as no:
+        made.numbers(bytes(8))
+    assert no.value.message == "A frame of Outer cannot be decoded."
+    assert made.numbers(bytes(8)) == {"torque": 7}
+
+
+def test_an_eds_file_needs_canopen_and_one_that_cannot_be_read_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "cell.eds"
+    path.write_text("[1000]")
+
+    def reader(error: Exception) -> Any:
+        def import_od(_path: str, *, node_id: int) -> None:
+            assert node_id == 1
+            raise error
+
+        return SimpleNamespace(import_od=import_od)
+
+    for error, reason in ((ValueError("  bad line\nand more"), "bad line"), (KeyError(), "KeyError"),
+                          (ValueError("x" * 300), "x" * 200)):  # fmt: skip
+        monkeypatch.setitem(sys.modules, "canopen", reader(error))
+        with pytest.raises(BadDataError) as no:
+            canopen_device.load(path)
+        assert no.value.message == f"{path} is not an EDS file that can be read: {reason}"
+        assert no.value.hint == "Check the file."
+    monkeypatch.setitem(sys.modules, "canopen", None)
+    with pytest.raises(NotFoundError) as none:
+        canopen_device.load(path)
+    assert none.value.message == "An EDS file needs the package canopen."
+    assert "[bench]" in (none.value.hint or "")
+
+
 @pytest.mark.parametrize(
     ("low", "high", "limits"),
     [
@@ -248,7 +303,7 @@ def test_a_lost_bus_is_closed_and_tried_again_ever_later_until_it_is_back(monkey
     troubles, said, waits, buses = list[str](), list[str](), list[float](), list[SensorsBus]()
     reader: Any = SimpleNamespace(message=SimpleNamespace(key=FrameKey(0x100, False)), note_trouble=troubles.append)
     made: Any = CanReader(cast("Any", None), [reader], said.append)
-    steps = [LinkError("Bus off."), None, *[NoReaderError("No such device.")] * 6, LinkError("Bus off.")]
+    steps: list[Any] = [LinkError("Bus off."), None, *[NoReaderError("No such device.")] * 6, LinkError("Bus off.")]
 
     def opened() -> SensorsBus:
         if isinstance(steps[0], NoReaderError):

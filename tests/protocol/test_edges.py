@@ -32,9 +32,14 @@ from teds_provision.protocol.keys import (
     verify_each_once,
 )
 from teds_provision.protocol.messages import smp
+from teds_provision.protocol.messages.arguments import _octets, read_plain
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.messages.message import compose_command, compose_service
 from teds_provision.protocol.messages.tables import describe_request
+from teds_provision.protocol.operation.can_frames import StreamAssembly
+from teds_provision.protocol.plant.document import Fields
+from teds_provision.protocol.plant.evidence import CheckedEvidence, Signatures, check_signatures
+from teds_provision.protocol.plant.roster import _roles
 from teds_provision.protocol.plant.signing import require_name
 from teds_provision.protocol.session import unpad
 from teds_provision.protocol.wire_agreement import StationAgreement
@@ -388,3 +393,65 @@ def test_a_der_signature_is_of_a_point_over_a_message_or_no_good() -> None:
 )
 def test_a_command_of_teds_is_described_with_its_teds_and_its_place(command: Command, words: str) -> None:
     assert describe_request(command) == words
+
+
+def test_what_was_begun_of_a_message_is_dropped_with_its_link() -> None:
+    assembly = StreamAssembly(10, fd=False)
+    assert assembly.add_segment(0, bytes(8)) is None
+    assembly.forget()
+    assert assembly.add_segment(1, bytes(2)) is None, "its beginning is gone"
+    assert (assembly.broken, assembly.wrong) == (0, 0), "and it counts as no fault of the bus"
+    assert assembly.add_segment(0, bytes(8)) is None
+    assert assembly.add_segment(1, b"ab") == bytes(8) + b"ab"
+
+
+@pytest.mark.parametrize(
+    ("layout", "payload", "values", "findings"),
+    [
+        ("level:f32", "3fc00000", [1.5], []),
+        ("level:f32", "3fc000", [b"\x3f\xc0\0"], ["argument-cut"]),
+        ("count:u16 ids:uuids", "0002" + "11" * 16 + "22" * 16, [2, (b"\x11" * 16, b"\x22" * 16)], []),
+        ("count:u16 ids:uuids last:u8", "0001" + "11" * 16 + "07", [1, (b"\x11" * 16,), 7], []),
+        ("count:u16 ids:uuids", "0002" + "11" * 16, [2, (b"\x11" * 16,)], ["argument-cut"]),
+        ("count:u16 names:texts last:u8", "0002" + "610062620007", [2, ("a", "bb"), 7], []),
+        ("name:text last:u8", "61620007", ["ab", 7], []),
+        ("last:u8", "0708", [7, b"\x08"], ["argument-rest"]),
+    ],
+)
+def test_arguments_one_after_the_other(layout: str, payload: str, values: list[Any], findings: list[str]) -> None:
+    arguments, found = read_plain(bytes.fromhex(payload), layout, 6)
+    assert [argument.value for argument in arguments] == values
+    assert [finding.code for finding in found] == findings
+
+
+def test_a_text_of_a_message_holds_no_nul() -> None:
+    assert _octets("texts", ("a", "bé")).hex() == "610062c3a900"
+    with pytest.raises(ValueError, match="a text ends at its first NUL"):
+        _octets("texts", ("a", "b\0c"))
+
+
+def test_a_proof_under_another_key_than_that_of_the_datasheet_is_checked_under_its_own() -> None:
+    """Whose key it is, is a fault of its own; the board has signed these facts all the same."""
+    board, shown = SoftwareKey(901), SoftwareKey(904)
+    for signer, good in ((board, True), (shown, False)):
+        evidence: Any = SimpleNamespace(
+            uuid=UUID, station=KEY.point, payload=b"", signature=b"", node=board.point, proof=signer.sign(b"board"),
+            verdict="failed",
+        )  # fmt: skip
+        teds: Any = SimpleNamespace(node_key=shown.point, node_key_signature=bytes(64), station_key=None)
+        checked = CheckedEvidence(evidence, teds, "", b"", b"board")
+        assert check_signatures(checked) == Signatures(False, False, None, good)
+
+
+@pytest.mark.parametrize(
+    ("roles", "read"),
+    [(["line", "keeper"], {"line", "keeper"}), (["line", "later"], {"line"}), (["later"], {"audit"}), ([], {"audit"})],
+)
+def test_roles_of_a_later_version_are_passed_over(roles: list[str], read: set[str]) -> None:
+    assert _roles(Fields({"roles": roles}, "It")) == read
+
+
+@pytest.mark.parametrize("roles", [["line", 1], [None], [["line"]]])
+def test_roles_are_words(roles: list[object]) -> None:
+    with pytest.raises(BadDataError, match="roles is no list of words"):
+        _roles(Fields({"roles": roles}, "It"))

@@ -9,10 +9,11 @@ import asyncio
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from teds_provision.errors import StoreError
 from teds_provision.node.ble import peripheral as ble_peripheral
 from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
@@ -177,3 +178,55 @@ def test_the_address_is_static_random_and_new_at_a_reset_alone(tmp_path: Path, m
     assert scene.address.address == second
     third = StaticAddress(tmp_path, factory=True).address
     assert third.octets != second.octets, "the power went between the reset and the look"
+
+
+def test_a_look_round_that_fails_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(tmp_path, monkeypatch, factory=False)
+    looks: list[int] = []
+
+    async def look() -> None:
+        looks.append(len(looks))
+        scene.peripheral._news.set()
+        if len(looks) == 1:
+            raise OSError("the controller is busy")
+        scene.peripheral._is_off = True
+
+    monkeypatch.setattr(scene.peripheral, "_look", look)
+    monkeypatch.setattr(ble_peripheral, "_LOOK_SECONDS", 0.001)
+    asyncio.run(scene.peripheral._look_after())
+    assert looks == [0, 1]
+
+
+def test_a_node_that_fails_does_not_reply_and_takes_the_next_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene(tmp_path, monkeypatch, factory=False)
+    scene.connect()
+    (line,) = scene.peripheral._lines.values()
+    replies: list[bytes] = []
+    answers = iter((StoreError("its flash file is gone"), b"\1\0\0"))
+
+    def answer(*_: object, **__: object) -> bytes:
+        found = next(answers)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    async def reply(_line: object, transaction: int, octets: bytes) -> None:
+        assert transaction == 7
+        replies.append(octets)
+
+    def at_once(work: Any, _loop: object) -> Any:
+        asyncio.run(work)
+        return SimpleNamespace(result=lambda: None)
+
+    scene.peripheral._node.reply_sent = scene.lost.append  # type: ignore[method-assign]
+    monkeypatch.setattr(line.repetition, "answer", answer)
+    monkeypatch.setattr(scene.peripheral, "_reply", reply)
+    monkeypatch.setattr(ble_peripheral.asyncio, "run_coroutine_threadsafe", at_once)
+    line.waiting = 2
+    job = scene.peripheral._job(line, cast("Any", SimpleNamespace(transaction=7, message=b"")), 0, cast("Any", None))
+    job()
+    assert (line.waiting, replies, scene.lost) == (1, [], [])
+    job()
+    assert (line.waiting, replies, scene.lost) == (0, [b"\1\0\0"], [line.name])
