@@ -91,6 +91,7 @@ def test_classes_that_2007_does_not_have() -> None:
     decoded, findings = to(octets_of("x24_security"), 2007)
     assert "class" in {finding.code for finding in findings}
     assert decoded.get("Level") == "E"
+    assert "class" not in {finding.code for finding in to(octets_of("x24_security"), 2024)[1]}
 
 
 def test_the_security_teds_of_the_profile_has_one_form() -> None:

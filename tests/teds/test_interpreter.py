@@ -555,6 +555,18 @@ def test_a_calibration_in_a_unit_without_a_name_is_shown_in_the_usual_one() -> N
     assert interpreter.uncertainty == pytest.approx(math.degrees(0.01))
 
 
+def test_a_temperature_in_a_unit_without_a_name_is_shown_in_degrees_celsius() -> None:
+    """The zero point of the shown unit is taken off in kelvins, before its scale."""
+    blocks = blocks_of("temperature-sensor")
+    part = CalibrationInput(1, 1, (0, 4096), (0,))
+    odd = Calibration(1, "linear", (part,), (500.0, 0.25), unit=WrittenUnit("(× 0.5 K)", parse_unit("K").units, 0.5))
+    blocks[1, AccessCode.CALIBRATION] = teds.compose(AccessCode.CALIBRATION, odd.fields())
+    interpreter = ChannelInterpreter(Sheet.from_blocks(blocks), 1)
+    assert interpreter.unit.text == "°C"
+    octets = (400).to_bytes(interpreter.reader.form.octets, "big")
+    assert interpreter.decode(octets).value[0] == pytest.approx(0.5 * (500 + 100) - 273.15)
+
+
 def test_what_is_not_described_is_refused() -> None:
     with pytest.raises(BadDataError, match="no channel 9"):
         ChannelInterpreter(ANGLE, 9)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -238,6 +239,17 @@ def test_a_curve_over_the_end_of_a_turn_has_a_gap_there() -> None:
     kept = values[~np.isnan(values)]
     assert (kept.min() >= 0, kept.max() <= 360) == (True, True)
     assert float(np.nanmax(np.abs(np.diff(kept)))) > 300
+
+
+def test_a_calibration_that_cannot_be_drawn_leaves_those_of_other_channels(finger, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """The first of two is unsound; of a chosen channel alone that one is drawn."""
+    part = CalibrationInput(1, 1, (0, 4095), (0,))
+    calibrations = {n: Calibration(n, "linear", (part,), (0.0, 0.25), unit=parse_unit("N")) for n in (1, 2, 3)}
+    sheet = SimpleNamespace(calibrations=calibrations)
+    monkeypatch.setattr(plot, "Sheet", SimpleNamespace(from_blocks=lambda _blocks: sheet))
+    monkeypatch.setattr(plot, "is_sound", lambda calibration: calibration.channel != 1)
+    assert [panel.title for panel in plot._panels({}, None, None, {})] == ["channel 2", "channel 3"]
+    assert [panel.title for panel in plot._panels({}, 3, None, {})] == ["channel 3"]
 
 
 def test_a_picture_goes_as_far_as_the_calibration_says_that_raw_values_go(finger) -> None:  # type: ignore[no-untyped-def]

@@ -207,6 +207,9 @@ def test_new_writes_into_the_working_folders_profiles_else_the_homes_and_says_wh
 ) -> None:
     assert text_of(capsys, "profile", "new", "a")[0] == ["home/profiles/a.toml written."]
     assert text_of(capsys, "profile", "new", "a")[0] == ["home/profiles/a.toml already exists."]
+    Path("profiles").write_text("a file of this name is no folder\n")
+    assert text_of(capsys, "profile", "new", "c")[0] == ["home/profiles/c.toml written."]
+    Path("profiles").unlink()
     Path("profiles").mkdir()
     assert text_of(capsys, "profile", "new", "a")[0] == ["profiles/a.toml written."]
     assert text_of(capsys, "profile", "new", "a", "-o", "mine.toml")[0] == ["mine.toml written."]

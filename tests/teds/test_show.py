@@ -4,12 +4,14 @@ import hashlib
 import json
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
+from teds_provision.teds import show
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats import TedsBlock, read_blocks
@@ -66,6 +68,15 @@ def test_a_uuid_of_2007_is_unpacked():
     summary = dict(shown_of(1, fields).summary)
     assert summary["made at"] == "30.2719° N, 120.1272° E"
     assert summary["made in"].startswith("2012-01-01")
+
+
+def test_a_uuid_with_a_time_beyond_its_year_shows_the_year_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = SimpleNamespace(plausible=True, degrees=(-30.5, -120.25), moment=None, year=2012, manufacturer=0)
+    monkeypatch.setattr(show, "unpack_uuid", lambda _octets: parts)
+    summary = dict(shown_of(1, {"UUID": bytes(10), "OholdOff": 1.0, "TestTime": 0.0, "MaxChan": 1}).summary)
+    assert summary["made in"] == "2012"
+    assert summary["made at"] == "30.5000° S, 120.2500° W"
+    assert "maker's number" not in summary
 
 
 def test_calibration_limits_are_in_the_calibrated_unit_if_the_channel_is_given():

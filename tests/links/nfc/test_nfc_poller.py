@@ -125,3 +125,21 @@ def test_what_breaks_the_wire_format_is_garbled(reads: list[bytes]) -> None:
 def test_a_node_that_takes_too_little_is_named() -> None:
     with pytest.raises(GarbledError, match="at most 30 octets"):
         Script(OK).transact(max_ndef=30)
+
+
+@pytest.mark.parametrize("max_ndef", [39, 33, 0])
+def test_a_node_whose_messages_hold_no_octet_of_an_answer_is_refused_unasked(max_ndef: int) -> None:
+    """profile.md: room for maxNdef - 33 octets in a request and 6 fewer in an answer."""
+    script = Script(OK, GOOD)
+    with pytest.raises(GarbledError, match=f"NDEF messages of at most {max_ndef} octets, too short"):
+        script.transact(max_ndef=max_ndef)
+    assert not script.written
+    assert Script(OK, GOOD).transact(max_ndef=40, frame=b"abcd"[:1]) == b"ok"
+
+
+def test_the_service_is_selected_once_for_all_transactions() -> None:
+    script = Script(OK, GOOD, answer(Piece(4, 2, 0, b"on", answer=True)))
+    service = tnep.ServiceParameters(tnep.SERVICE, 4, 15, 300)
+    poller = Poller(script, service, clock=lambda: script.now, sleep=script.sleep)
+    assert (poller.transact(3, b"abcd"), poller.transact(4, b"efgh")) == (b"ok", b"on")
+    assert script.written.count(select()) == 1
