@@ -248,8 +248,8 @@ def test_a_calibration_that_cannot_be_drawn_leaves_those_of_other_channels(finge
     sheet = SimpleNamespace(calibrations=calibrations)
     monkeypatch.setattr(plot, "Sheet", SimpleNamespace(from_blocks=lambda _blocks: sheet))
     monkeypatch.setattr(plot, "is_sound", lambda calibration: calibration.channel != 1)
-    assert [panel.title for panel in plot._panels({}, None, None, {})] == ["channel 2", "channel 3"]
-    assert [panel.title for panel in plot._panels({}, 3, None, {})] == ["channel 3"]
+    assert [panel.name for panel in plot._panels({}, None, None, {})] == ["channel 2", "channel 3"]
+    assert [panel.name for panel in plot._panels({}, 3, None, {})] == ["channel 3"]
 
 
 def test_a_picture_goes_as_far_as_the_calibration_says_that_raw_values_go(finger) -> None:  # type: ignore[no-untyped-def]
