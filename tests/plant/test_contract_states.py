@@ -223,7 +223,7 @@ def test_each_station_has_its_state_and_age(station: Station, monkeypatch: pytes
     assert found.exit_code == 4
     assert replace(found, standings=found.standings[1:]).exit_code == 6, "this one was removed"
     assert parcels.silent_stations(station, now, moment) == {at["old"]}
-    paged(station, station.fingerprint, 3, created(week + 1))
+    paged(station, station.fingerprint, 4, created(week + 1))
     assert parcels.silent_stations(station, now, moment) == {at["old"]}, "the other members"
 
 

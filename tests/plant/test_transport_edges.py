@@ -1201,7 +1201,7 @@ def test_what_both_sides_have_of_others_is_new_if_any_part_of_it_is() -> None:
     assert digest(states=("", "")) == ""
 
 
-def test_who_is_in_no_roster_joins_none(station: Station) -> None:
+def test_who_is_in_no_roster_joins_none(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
     held = station.plant.roster
     assert held is not None
     with pytest.raises(PolicyError) as error:
@@ -1211,9 +1211,11 @@ def test_who_is_in_no_roster_joins_none(station: Station) -> None:
         "Send its owner a request (registry request --output FILE); the owner then runs: registry add FILE --role …",
     )
     events = [("closed", None, {"job": "11111111-2222-4333-8444-555555555555"})]
-    assert not station.row_macs.active
+    order, transaction = list[str](), station.transaction
+    monkeypatch.setattr(station, "unlock", lambda: order.append("unlock"))
+    monkeypatch.setattr(station, "transaction", lambda: order.append("transaction") or transaction())
     assert owner.join(station, held, url="file:/stick", events=cast("Any", events)) == 1
-    assert station.row_macs.active, "what is kept of the roster is kept with its MAC"
+    assert order[:2] == ["unlock", "transaction"], "nobody types a passphrase while the store is held"
     record = station.plant.joined
     assert record is not None
     assert (record.url, len(station.plant.outbox(9))) == ("file:/stick", 1)

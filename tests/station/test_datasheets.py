@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 
@@ -84,6 +85,22 @@ def test_after_a_restart_a_reading_is_of_its_session_and_no_longer_whole(station
     assert not station.datasheets.keep_reading(outside), "one outside a session takes the place of none of a session"
     assert station.datasheets.keep_reading(reading)
     assert station.datasheets.reading(NODE) == reading
+
+
+def test_what_a_reading_says_of_itself() -> None:
+    checks = json.dumps([["signed", "passed"], ["form", "failed", "why"], ["origin", "skipped"], ["ca", "unknown", ""]])
+    reading = NodeReading(NODE, "2026-11-27T12:00:00Z", "verify", None, False, b"", checks=checks)
+    assert reading.failed == {"form"}
+    assert replace(reading, checks="[]").failed == frozenset()
+    session = (1 << 64) - 2
+    seen = [(None, False), (None, True), (session.to_bytes(8, "big"), False)]
+    assert [(r.in_session, r.is_datasheet) for r in (replace(reading, c=c, whole=whole) for c, whole in seen)] == [
+        (False, False), (False, True), (True, True)
+    ]  # fmt: skip
+    steps = (-1, 0, 1, 2, (1 << 32) - 1, 1 << 32)
+    later = [((session + step) % (1 << 64)).to_bytes(8, "big") for step in steps]
+    assert [replace(reading, c=seen[2][0]).is_of_this_start(c) for c in later] == [False, True, True, True, True, False]
+    assert not reading.is_of_this_start(later[1])
 
 
 def test_with_its_reading_a_node_that_was_reset_loses_its_firmware_report(station: Station) -> None:
