@@ -514,8 +514,6 @@ def format_value(value: float, unit: WrittenUnit, *, difference: bool = False, d
     if math.isnan(value):
         return "not available"
     shown = unit.difference_from_si(value) if difference else unit.from_si(value)
-    if difference and value < 0:
-        shown = -abs(shown)
     text = f"{shown:.{digits}g}"
     return f"{text} {unit.text}".strip()
 

@@ -141,6 +141,14 @@ def test_what_does_not_fit_together_is_refused(
         CalibrationInput(1, 1, (0.0, 1.0), (0.0, 1.0))
 
 
+@pytest.mark.parametrize("name", ["zero_offset", "low_limit", "high_limit", "uncertainty"])
+def test_each_number_of_a_calibration_is_a_float32(name: str) -> None:
+    assert getattr(replace(SPLINE, **{name: 0.1}), name) == 0.10000000149011612  # type: ignore[arg-type]
+    with pytest.raises(BadDataError) as refused:
+        replace(SPLINE, **{name: 1e39})  # type: ignore[arg-type]
+    assert refused.value.message == f"{name} of the calibration hold a number that does not fit a Float32."
+
+
 # --- fits
 
 
@@ -165,6 +173,12 @@ def test_a_curve_takes_one_value_for_each_input(given: int) -> None:
     assert refused.value.message == f"The calibration of channel 1 takes 1 inputs, not {given}."
 
 
+def test_points_are_left_out_of_a_fit_of_at_most_200_of_them() -> None:
+    for points, kept in ((3, 1), (200, 198), (201, 0)):
+        line = fit([(float(raw), 2.0 * raw) for raw in range(points)], "linear", channel=1)
+        assert left_out(line) == pytest.approx([0.0] * kept, abs=1e-3), points
+
+
 def test_a_table_of_which_a_point_cannot_be_left_out_has_no_such_differences() -> None:
     """Without one of three points, two are left: too few for a polynomial of degree 2."""
     three = fit([(0, 0), (1, 2), (2, 8)], "polynomial", channel=1)
@@ -172,6 +186,13 @@ def test_a_table_of_which_a_point_cannot_be_left_out_has_no_such_differences() -
     assert left_out(three) == ()
     assert left_out(fit([(0, 0), (1, 3), (2, 8)], "linear", channel=1)) == pytest.approx((-1.0,))
     assert left_out(fit([(0, 0), (2, 8)], "linear", channel=1)) == ()
+
+
+def test_a_date_before_1970_and_a_length_of_time_in_whole_seconds() -> None:
+    octets = teds.compose(5, [*SPLINE.fields(), ("LstCalDt", teds.TimeInstance(5, 0, True))])
+    assert from_decoded(teds.decode(octets), channel=1).date == datetime(1969, 12, 31, 23, 59, 55, tzinfo=UTC)
+    for interval, seconds in ((86399.6, 86400), (86400.4, 86400), (0.5, 0)):
+        assert dict(replace(SPLINE, interval=interval).fields())["CalInrvl"] == teds.TimeInstance(seconds), interval
 
 
 def test_a_due_date_beyond_the_calendar_is_none() -> None:

@@ -480,3 +480,16 @@ def test_what_is_just_allowed(angle: Profile) -> None:
     assert pairs(f"1,2\n3,{'4'.rjust(19_998)}\n") == [(1.0, 2.0), (3.0, 4.0)]
     with pytest.raises(BadDataError, match=r"c\.csv:2: the line has more than 20000 characters"):
         pairs(f"1,2\n3,{'4'.rjust(19_999)}\n")
+
+
+def test_an_input_is_of_its_own_channel_and_degree_1_unless_the_file_states_another() -> None:
+    inputs = "[[inputs]]\nboundaries = [0, 9]\noffsets = [1]\n"
+    finger = load_profile("tactile-finger-sensor")
+    for more, part in (
+        ("", CalibrationInput(2, 1, (0.0, 9.0), (1.0,))),
+        ("degree = 0\n", CalibrationInput(2, 0, (0.0, 9.0), (1.0,))),
+        ("degree = 3\nchannel = 5\nkey = 6\n", CalibrationInput(5, 3, (0.0, 9.0), (1.0,), 6)),
+    ):
+        coefficients = list(range(1, part.degree + 2))
+        text = f"coefficients = {coefficients}\n{inputs}{more}"
+        assert read_calibrations(text, "c.toml", finger, channel=2)[2].inputs == (part,), more

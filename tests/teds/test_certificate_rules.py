@@ -130,7 +130,12 @@ def test_how_a_unit_is_written(unit: str, written: tuple[str, float, float]) -> 
 
 
 @pytest.mark.parametrize(
-    "text", [r"\kelvin\tothe{0.3}", r"\metre\tothe{64}", r"\metre\per\per\second", r"\per\tothe{2}"]
+    "text",
+    [
+        *(r"\kelvin\tothe{0.3}", r"\metre\tothe{64}", r"\metre\per\per\second", r"\per\tothe{2}"),
+        *(r"\metre\kilo\tothe{2}\second", r"\metre\per\tothe{2}", r"\tothe{2}", r"\kilo\tothe{2}\metre"),
+        *(r"\metre\tothe{2}\tothe{2}", r"\kilo\milli\metre", r"\metre\kilo", r"\metre\per", r"\kilo\per\metre", ""),
+    ],
 )
 def test_a_power_that_a_teds_cannot_hold_and_a_sign_without_a_unit_are_refused(text: str) -> None:
     with pytest.raises(BadDataError):
@@ -218,6 +223,22 @@ def test_points_that_relate_values_to_another_quantity_do_not_fit() -> None:
     with pytest.raises(BadDataError) as refused:
         calibrated(inside, angle())
     assert refused.value.message.endswith("(degree): t: it relates the values to V, not to raw numbers.")
+
+
+def test_of_several_results_without_an_indication_any_is_answered_with_the_key_that_states_one() -> None:
+    """Whichever comes first; the others are named with what is wrong with each."""
+    other = table(listed("measuredValue", "1 2", r"\one"), listed("referenceValue", "3 4", r"\newton"), name="a")
+    plain = table(listed("measuredValue", "1 2", r"\one"), listed("referenceValue", "3 4", r"\one"), name="b")
+    for results in (other + plain, plain + other):
+        with pytest.raises(BadDataError, match=r"^No result of c\.xml fits channel 1 \(%\): ") as refused:
+            calibrated(results, angle("%"))
+        assert "b: nothing states which raw number gives an indication" in refused.value.message
+        assert refused.value.hint == (
+            "Say it in the profile, in %: [channel.1.calibration] indication = [slope, intercept]"
+        )
+    with pytest.raises(BadDataError) as refused:
+        calibrated(other, angle("%"))
+    assert refused.value.hint == "See: teds-provision show c.xml"
 
 
 def test_each_coefficient_must_be_one_of_a_raw_number() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError
-from teds_provision.teds.codec.frame import unframe
+from teds_provision.teds.codec.frame import frame, unframe
 from tests.teds.vectors import octets_of
 
 META = {"UUID": "94A964323E81FA8003E8", "OholdOff": 0.5, "TestTime": 5, "MaxChan": 2}
@@ -86,8 +86,10 @@ def test_width_grows_only_if_it_must() -> None:
     assert teds.decode(long).get("Coefs") == (0.5,) * 1000
     with pytest.raises(BadDataError, match="Field 129"):
         teds.compose(5, {"Coefs": [1.0] * 64}, width=1)
-    with pytest.raises(BadDataError, match="Field 129"):
+    with pytest.raises(BadDataError) as refused:
         teds.compose(5, {"Coefs": [1.0] * 20000})
+    assert refused.value.message.startswith("Field 129 of CalTEDS has 80000 octets and does not fit tuples of 2 length")
+    assert refused.value.hint == "Give a greater width, up to 4."
     assert len(teds.compose(5, {"Coefs": [1.0] * 20000}, width=3)) > 80000
 
 
@@ -112,7 +114,9 @@ def test_numpy_arrays_are_arrays() -> None:
 @pytest.mark.parametrize(
     ("fields", "named"),
     [
-        ({**META, "MaxChan": 70000}, "MaxChan"),
+        ({**META, "MaxChan": 70000}, "MaxChan goes from 0 to 65535, 70000 does not fit"),
+        ({**META, "MaxChan": 65536}, "MaxChan goes from 0 to 65535, 65536 does not fit"),
+        ({**META, "VGroup": {"GrpType": 256, "MemList": [1]}}, "GrpType goes from 0 to 255, 256 does not fit"),
         ({**META, "MaxChan": -1}, "MaxChan"),
         ({**META, "MaxChan": 1.5}, "MaxChan"),
         ({**META, "MaxChan": "two"}, "MaxChan"),
@@ -207,6 +211,8 @@ def test_negative_times() -> None:
     assert teds.decode(octets).get("LstCalDt") == teds.TimeInstance(1, 500_000_000, True)
     with pytest.raises(BadDataError, match="LstCalDt"):
         teds.compose(5, {"LstCalDt": -1.5}, edition=2024)
+    length = teds.compose(5, {"CalInrvl": -1.5}, edition=2024)  # a duration has one form in both editions
+    assert teds.decode(length).get("CalInrvl") == teds.TimeInstance(1, 500_000_000, True)
 
 
 @pytest.mark.parametrize(
@@ -220,6 +226,12 @@ def test_impossible_requests(access_code: int, options: dict[str, int]) -> None:
 def test_tedsid_may_be_given() -> None:
     octets = teds.compose(1, {**META, "UUID": bytes(16), "TEDSID": {"family": 99, "subfamily": 1}}, edition=2024)
     assert teds.decode(octets).get("TEDSID") == (99, 1, 1, 2, 1)
+
+
+def test_a_tedsid_with_a_width_that_is_none_gives_tuples_of_one_length_octet_again() -> None:
+    for width in (0, 5, 255):
+        octets = frame(bytes.fromhex(f"0304000c01{width:02x} 040100 050161"))
+        assert teds.recompose(teds.decode(octets)) == octets, width
 
 
 def test_numpy_numbers_are_numbers() -> None:

@@ -132,6 +132,9 @@ def _vector(name):
         (b'{"protected": "e30", "recipients": [], "iv": "", "ciphertext": "", "tag": ""}', "bundle"),
         (b'  <?xml version="1.0"?><teds-set xmlns="urn:teds-provision:teds:1"/>', "xml"),
         (b'extends = "load-cell"\n', "toml"),
+        (b" [channel.1]\n", "toml"),
+        (b"[[text]]\n", "toml"),
+        (b"[{}]", "json"),
         (b"00 00 zz", "hex"),
         (b"\xff\xfe\x00\x01", "binary"),
     ],
@@ -192,6 +195,20 @@ def test_hex_keeps_places_in_comments_and_other_comments_mean_nothing():
     assert read_blocks(b"# made by somebody\n" + text.encode()) == blocks
 
 
+def test_hex_states_the_place_of_a_teds_where_its_octets_would_be_taken_for_another() -> None:
+    for block, place in (
+        (TedsBlock(None, 12, NAME), ""),
+        (TedsBlock(None, 1, NAME), "# channel - access code 1 (MetaTEDS)"),
+        (TedsBlock(None, None, NAME), "# channel - access code -"),
+        (TedsBlock(0, 12, NAME), "# channel 0 access code 12 (XdcrName)"),
+        (TedsBlock(None, 12, NAME + META), "# channel - access code 12 (XdcrName)"),
+    ):
+        text = write_blocks([block], "hex")
+        assert isinstance(text, str)
+        assert "".join(line for line in text.splitlines() if line.startswith("#")) == place
+        assert read_blocks(text.encode(), "hex") == [block]
+
+
 def test_intel_hex_crosses_64_kib_and_is_what_other_tools_read():
     blocks = [
         TedsBlock(None, 1, META),
@@ -229,8 +246,13 @@ def test_an_image_needs_a_uuid_and_places():
     assert (image["uuid"], len(image["blocks"])) == ("00010203040506070809", 2)
     with pytest.raises(BadDataError, match="UUID"):
         write_blocks([TedsBlock(0, 12, NAME)], "image")
-    with pytest.raises(BadDataError, match="channel and access code"):
-        write_blocks([TedsBlock(None, 12, NAME)], "image")
+    long = teds.compose(1, {"UUID": bytes(range(16)), "MaxChan": 1}, edition=2024)
+    with pytest.raises(BadDataError, match=r"^An image needs a Meta-TEDS on channel 0 with a UUID of 10 octets\.$"):
+        write_blocks([TedsBlock(0, 1, long)], "image")
+    for place in ((None, 12), (1, None), (None, None)):
+        with pytest.raises(BadDataError, match="channel and access code") as refused:
+            write_blocks([TedsBlock(*place, NAME)], "image")
+        assert refused.value.hint == "Use hex, json or xml."
     with pytest.raises(BadDataError, match="Two TEDS"):
         write_blocks([TedsBlock(0, 1, META), TedsBlock(0, 1, META)], "image")
 

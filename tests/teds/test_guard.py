@@ -134,6 +134,11 @@ def test_a_damaged_teds_is_refused(magnetic: Profile) -> None:
     octets = bytearray(blocks[1, 5])
     octets[20] ^= 1
     assert codes(check_calibration({**blocks, (1, 5): bytes(octets)}, None, magnetic)) == {"unreadable"}
+    content = bytearray(teds.compose(5, [*angle_table(5).fields(), ("200", b"")]))
+    content[-4:-2] = b"\x03\x00"  # a second type 3: its content is wrong too, and still it would be understood
+    decoded = teds.decode(bytes(content))
+    assert decoded.verdict == "frame-and-content-bad"
+    assert codes(check_calibration({**blocks, (1, 5): bytes(content)}, None, magnetic)) == {"unreadable"}
 
 
 def test_coefficients_that_do_not_fit_their_segments_are_refused(tactile: Profile) -> None:

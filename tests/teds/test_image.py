@@ -99,6 +99,12 @@ def test_another_document_is_no_image(text: str) -> None:
     assert refused.value.message == 'This is not a TEDS image: "format" is not "teds-image/1".'
 
 
+@pytest.mark.parametrize("text", ["[" * 5000, '{"format": ' * 5000, b"[" * 5000])
+def test_a_nest_without_end_is_no_image(text: str | bytes) -> None:
+    with pytest.raises(BadDataError):
+        Image.from_json(text)
+
+
 @pytest.mark.parametrize("note", ["", '"note": 1, '], ids=["plain", "member by member"])
 @pytest.mark.parametrize(("access_code", "channel"), [(0, 0), (255, 65535)])
 def test_an_image_holds_every_access_code_and_channel(access_code: int, channel: int, note: str) -> None:

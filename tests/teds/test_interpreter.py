@@ -405,8 +405,9 @@ def test_a_compensated_channel_asks_for_its_other_input() -> None:
     own, other = np.array([5000, 6000], dtype=">u2").tobytes(), np.array([10, 20], dtype=">u2").tobytes()
     values = interpreter.decode(own, {2: other})
     assert values.value.tolist() == [evaluate(both, 5000, 10).value, evaluate(both, 6000, 20).value]
-    with pytest.raises(BadDataError, match="compensated by channel 2"):
-        interpreter.decode(own)
+    for others in (None, {}, {2: other[:2]}, {2: other + other}):
+        with pytest.raises(BadDataError, match=r"^Channel 1 is compensated by channel 2, which is not given\.$"):
+            interpreter.decode(own, others)
     back = interpreter.encode(values.value, {2: np.array([10, 20], dtype=np.uint64)})
     assert back == own
     assert "not described" in ChannelInterpreter(replace(sheet, channels=sheet.channels[:1]), 1).problem

@@ -139,6 +139,20 @@ def test_what_is_no_xml_or_in_an_unknown_encoding_is_refused(octets: bytes) -> N
 
 
 @pytest.mark.parametrize(
+    ("mapping", "hint"),
+    [
+        ('channel = "c["\n', 'Write names of elements: "Range/Low", or "Range/@unit".'),
+        ('channel = "c"\n[channel-keys]\nname = 3\n', 'Write key = "Path", or { at = "Path", unit = "degree" }.'),
+        ('channel = "c"\nkeys = 3\n', "Write [keys]."),
+    ],
+)
+def test_what_is_wrong_with_a_mapping_is_answered_with_how_to_write_it(mapping: str, hint: str) -> None:
+    with pytest.raises(BadDataError) as refused:
+        profile_from_xml(XML, mapping, name="lab")
+    assert refused.value.hint == hint
+
+
+@pytest.mark.parametrize(
     "bomb",
     [
         b'<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><d><c><n>&b;</n></c></d>',

@@ -15,6 +15,7 @@ from teds_provision.teds.codec.frame import frame, raw_tuple
 from teds_provision.teds.codec.text_lines import MOST_OCTETS, compose_lines, read_lines
 from teds_provision.teds.formats import TedsBlock
 from teds_provision.teds.origin import ORIGIN, Origin, origin_of, read_origin
+from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.show import describe
 from teds_provision.teds.value_table import read_value_table, signal_xml
 
@@ -41,6 +42,12 @@ def test_what_is_written_is_read_back_and_the_decoder_has_nothing_against_it(ori
     assert teds.recompose(decoded) == octets
     assert decoded.get("Lines") == octets[12:-2].decode()
     assert origin_of({ORIGIN: octets}) == origin
+
+
+def test_a_node_without_a_meta_teds_has_its_name_and_origin_all_the_same() -> None:
+    name = teds.compose(12, {"Format": 0, "TCName": "bench"})
+    meta = Sheet.from_blocks({ORIGIN: TORQUE.encode(), (0, 12): name}).meta
+    assert (meta.origin, meta.name, meta.uuid) == (TORQUE, "bench", None)
 
 
 @given(st.binary(max_size=300))

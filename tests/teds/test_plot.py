@@ -280,3 +280,12 @@ def test_25_channels_do_not_fit_one_picture(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(UsageError, match="25 channels do not fit one picture") as refused:
         plot_blocks({}, tmp_path / "x.svg")
     assert refused.value.hint == "Choose one with --channel."
+
+
+def test_the_axis_of_a_calibration_without_a_unit_is_of_counts() -> None:
+    angle = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+    own = replace(angle.channels[0], unit=parse_unit("count"))
+    own = replace(own, fields={**own.fields, "PhyUnits": own.unit.units})
+    made = read_calibrations("0,0\n65535,9\n", "x.csv", replace(angle, channels=(own,)))
+    upper, lower = drawn(replace(angle, channels=(own,)).build(UUID, calibration=made).blocks)
+    assert (upper.text("set_ylabel"), lower.text("set_xlabel")) == ("value [count]", "raw")

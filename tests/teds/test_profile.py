@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 import tomllib
@@ -31,7 +32,7 @@ from teds_provision.teds.profile import (
     shipped_profiles,
     template,
 )
-from teds_provision.teds.profile.load import parse_profile
+from teds_provision.teds.profile.load import files_digest, parse_profile
 from teds_provision.teds.profile.model import CalibrationDemand
 from teds_provision.teds.profile.reader import key_lines
 from teds_provision.teds.show import describe
@@ -266,6 +267,29 @@ def test_tables_are_laid_over_each_other_key_by_key_and_lists_replaced_whole(tmp
     assert fields["Sample"] == {"DatModel": 0, "ModLenth": 2, "SigBits": 10}
     assert fields["Sampling"] == {"SampMode": 8, "SDefault": 8}
     assert [(text.access_code, text.text) for text in profile.texts] == [(11, "c")]
+
+
+def test_a_nodes_name_is_the_title_and_the_title_that_of_the_file(tmp_path: Path) -> None:
+    without = GOOD.partition("\n")[2]
+    for head, names in (
+        ("", ("force", "force")),
+        ('title = "Force"\n', ("Force", "Force")),
+        ('title = "Force"\nname = "f"\n', ("Force", "f")),
+    ):
+        profile = load_profile(write(tmp_path, "force", head + without))
+        assert (profile.name, profile.title, profile.tim_name) == ("force", *names)
+
+
+def test_the_digest_of_a_type_is_that_of_its_file_or_of_all_from_the_outermost_base_on(tmp_path: Path) -> None:
+    """contract/plant.md section 9: each preceded by its length as u32."""
+    base = write(tmp_path, "base", GOOD)
+    middle = write(tmp_path, "middle", 'extends = "base"\n')
+    own = write(tmp_path, "own", 'extends = "middle"\ntitle = "Ä"\n')
+    assert files_digest(base, [tmp_path]) == hashlib.sha256(GOOD.encode()).hexdigest()
+    framed = len(GOOD).to_bytes(4, "big") + GOOD.encode() + b'\0\0\0\x11extends = "base"\n'
+    assert files_digest(middle, [tmp_path]) == hashlib.sha256(framed).hexdigest()
+    framed += b"\0\0\0\x20" + 'extends = "middle"\ntitle = "Ä"\n'.encode()
+    assert files_digest(own, [tmp_path]) == hashlib.sha256(framed).hexdigest()
 
 
 def test_a_name_has_120_octets_and_a_degree_is_from_1_to_12(tmp_path: Path) -> None:
@@ -870,6 +894,18 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         (
             "[[meta.proxy]]\nchannel = 1\norganization = 1\nmembers = [1, 2, 3]\n",
             "meta.proxy[0].members: the type has no channel 2, 3.",
+        ),
+        *(
+            (f"{table}\nqqq = 1\n", f"{field}.qqq: there is no such key. Known here: ")
+            for table, field in (
+                ("[[meta.proxy]]", "meta.proxy[0]"),
+                ("[[meta.vector-group]]\ntype = 0\n[[meta.vector-group]]", "meta.vector-group[1]"),
+                ("[phy]", "phy"),
+                ("[[text]]", "text[0]"),
+                ("[firmware]", "firmware"),
+                ("[channel.1.calibration]", "channel.1.calibration"),
+                ("[channel.1.data-set]", "channel.1.data-set"),
+            )
         ),
     ],
 )

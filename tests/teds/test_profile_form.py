@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
+from teds_provision import teds
 from teds_provision.teds.formats.profileform import read_profile, spell, write_profile
 from teds_provision.teds.image import TedsBlock
 from teds_provision.teds.profile import load_profile
@@ -210,3 +212,12 @@ def test_units_are_spelt_so_that_they_are_read_again() -> None:
         "%": "ratio",
         "1/s": "1/s",
     }
+
+
+def test_any_character_of_a_name_is_written_as_toml_reads_it() -> None:
+    """TOML allows no control character in a text, DEL among them."""
+    name = 'a"b\\c\n\r\t\x00\x1f\x7f\x80ä'
+    text, _ = write_profile([TedsBlock(0, 12, teds.compose(12, {"Format": 0, "TCName": name}))])
+    spelt = 'name = "a\\"b\\\\c\\n\\r\\t\\u0000\\u001f\\u007f\x80ä"'
+    assert spelt in text.split("\n")
+    assert tomllib.loads(spelt) == {"name": name}

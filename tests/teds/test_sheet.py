@@ -217,3 +217,13 @@ def test_no_octets_make_a_sheet_raise(data: st.DataObject) -> None:
         assert channel.overdue(WHEN) in (True, False)
         assert channel.sample is None or isinstance(channel.sample.name + channel.sample.problem, str)
     json.dumps([finding.message for finding in sheet.findings])
+
+
+def test_a_finding_of_the_decoder_keeps_its_place_and_its_words() -> None:
+    image = image_of("tactile-finger-sensor")
+    damaged = image.blocks[2, 12][:-1] + bytes([image.blocks[2, 12][-1] ^ 1])
+    sheet = Sheet.from_image(Image(image.uuid, {**image.blocks, (2, 12): damaged}))
+    (finding,) = sheet.findings
+    assert (finding.channel, finding.access_code, finding.severity, finding.code) == (2, 12, "error", "frame-checksum")
+    assert finding.offset == len(damaged) - 2
+    assert finding.message.startswith("The checksum is ")

@@ -95,7 +95,7 @@ def test_ratios_logs_and_digital_data_have_their_interpretation(
 
 
 def test_counts_are_the_plain_product_of_nothing() -> None:
-    assert u.parse_units("count") == u.parse_units("1") == Units()
+    assert u.parse_units("count") == u.parse_units("1") == u.parse_units("1/1") == Units()
 
 
 def test_the_table_agrees_with_pint() -> None:
@@ -301,10 +301,28 @@ def test_times_are_read_as_written(written: object, seconds: float) -> None:
     assert u.parse_seconds(written) == pytest.approx(seconds)
 
 
-@pytest.mark.parametrize("written", ["soon", "3 N", "0 Hz", [], True, None, ""])
-def test_what_is_no_time_is_refused(written: object) -> None:
-    with pytest.raises(BadDataError):
+@pytest.mark.parametrize(
+    ("written", "message", "hint"),
+    [
+        *(
+            (written, f"{written!r} is not a time.", 'Write a number of seconds, or a text like "100 us" or "1 year".')
+            for written in ("soon", [], True, None, "")
+        ),
+        ("3 N", '"3 N" is not a time: N is no unit of time.', 'Write it like "100 us", "5 s" or "10 kHz".'),
+        ("0 Hz", '"0 Hz" is not a time: Hz is no unit of time.', 'Write it like "100 us", "5 s" or "10 kHz".'),
+    ],
+)
+def test_what_is_no_time_is_refused_with_a_cure(written: object, message: str, hint: str) -> None:
+    with pytest.raises(BadDataError) as refused:
         u.parse_seconds(written)
+    assert (refused.value.message, refused.value.hint) == (message, hint)
+
+
+def test_a_unit_has_at_most_64_characters() -> None:
+    assert u.parse_unit("m" + " " * 62 + "m").units == u.parse_unit("m²").units
+    with pytest.raises(BadDataError) as refused:
+        u.parse_unit("m" + " " * 63 + "m")
+    assert refused.value.message == "A unit has at most 64 characters, this one 65."
 
 
 def test_everyday_units_do_not_load_pint() -> None:

@@ -338,6 +338,19 @@ def one(**field: object) -> str:
             "The seconds of TEDS 1, x is not a number from 0 to 28147",
         ),
         (one(name="x", kind="octets", value="0g"), "The octets of TEDS 1, x are not hex digits."),
+        (one(name="x", kind="units", value={"parsecs": 1, "b": 1}), "Units have no part 'b'."),
+        *(
+            (one(name="x", kind="units", value={name: text}), "The units hold an exponent that is not a number.")
+            for name in ("meters", "interpretation")
+            for text in ("1/0" if name == "meters" else "1.5", "x", "")
+        ),
+        *(
+            (
+                one(name="x", kind="units", value={"meters": text}),
+                "Exponents of units are multiples of 1/2 from -64 to 63.5.",
+            )
+            for text in ("1/3", "0.25", "-64.5", "64.5")
+        ),
     ],
 )
 def test_what_is_wrong_with_json_in_whole_words(text: str, message: str) -> None:
@@ -377,6 +390,8 @@ def around(inside: str) -> str:
             for kind in ("units", "number", "time")
         ),
         ("<a><b></a>", "This is not XML: "),
+        ('<?xml version="1.0" encoding="no-such"?><a/>', "This is not XML: unknown encoding: no-such."),
+        ('<?xml version="1.0" encoding="big5"?><a/>', "This is not XML: multi-byte encodings are not supported."),
         ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "The XML holds a DTD or an entity, which is refused."),
     ],
 )
