@@ -33,6 +33,7 @@ from teds_provision.teds.calibration import (
     residuals,
     sentence,
 )
+from teds_provision.teds.calibration.formula import kind_of
 from teds_provision.teds.profile import Profile, load_profile
 from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.units import parse_unit
@@ -659,6 +660,24 @@ def test_every_point_stays_within_the_tolerance_of_the_nodes_that_are_kept(toler
     assert table.inputs[0].boundaries == tuple(nodes)
     for raw, value in POLYGON:
         assert abs(evaluate(table, raw).value - value) <= tolerance + 1e-6
+
+
+def test_a_curve_that_leaves_the_numbers_is_not_inverted() -> None:
+    steep = Calibration(1, "polynomial", (CalibrationInput(1, 64, (0, 65535), (0,)),), (*[0.0] * 64, 1.01))
+    with pytest.raises(BadDataError, match="its curve does not rise or fall all the way"):
+        PreparedInverse(PreparedCurve(steep), 0.0, 65535.0)(np.array([1.0]))
+
+
+def test_the_kind_of_a_curve_in_words() -> None:
+    for points, method, words in (
+        (2, "table", "table of 1 segment"),
+        (3, "table", "table of 2 segments"),
+        (2, "steps", "steps of 2 segments"),
+        (3, "linear", "linear"),
+        (4, "polynomial", "polynomial of degree 3"),
+    ):
+        assert kind_of(fit(POLYGON[:points], method, channel=1)) == words  # type: ignore[arg-type]
+    assert kind_of(replace(SPLINE, method="linear")) == "linear, 2 segments"
 
 
 def test_of_two_points_none_is_left_out() -> None:

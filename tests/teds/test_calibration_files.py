@@ -111,6 +111,19 @@ def test_a_mistake_in_a_csv_is_named_with_its_line(text: str, message: str) -> N
 
 
 @pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("1,2,3\n", 'Name them in the first line: "raw, value" or "channel, raw, value".'),
+        ("# by: me\n", "It takes lines of raw value and value, like: 512, 10.5"),
+    ],
+)
+def test_a_file_that_is_no_table_of_points_is_answered_with_how_one_looks(text: str, hint: str) -> None:
+    with pytest.raises(BadDataError) as refused:
+        table(text)
+    assert refused.value.hint == hint
+
+
+@pytest.mark.parametrize(
     ("text", "name", "message"),
     [
         ("slope = 1\nslop = 2\n", "c.toml", 'c.toml:2: slop: there is no such key. Did you mean "slope"?'),
@@ -327,7 +340,7 @@ def test_the_method_of_segments_follows_from_their_degree(columns: str, row: str
 
 def test_which_channels_a_file_is_for(finger: Profile, angle: Profile) -> None:
     points = "points = [[0, 0], [65535, 1]]\n"
-    for channel, numbers in (("2", [2]), ("'2-4'", [2, 3, 4]), ("'all'", list(range(1, 13))), ("' 3 - 3 '", [3])):
+    for channel, numbers in (("2", [2]), ("'2-4'", [2, 3, 4]), ("' all '", list(range(1, 13))), ("' 3 - 3 '", [3])):
         assert list(read_calibrations(f"channel = {channel}\n{points}", "c.toml", finger)) == numbers
     assert list(read_calibrations(points, "c.toml", finger, channel=5)) == [5]
     assert list(read_calibrations(f"channel = '1-3'\n{points}", "c.toml", finger, channel=2)) == [2]

@@ -476,10 +476,24 @@ def test_a_result_without_a_list_is_a_table_of_its_own_quantities() -> None:
 def test_a_list_in_a_list_has_its_own_name_or_that_above() -> None:
     inner = _row(listed("a", "1 2"))
     named = inner.replace("<dcc:list>", "<dcc:list><dcc:name><dcc:content>inner</dcc:content></dcc:name>")
-    assert [(t.name, t.id) for t in read(table(inner, named, name="outer")).tables] == [
-        ("Points of channel 1", "1"),
-        ("inner", "2"),
+    stated = inner.replace("<dcc:list>", "<dcc:list refType='x_beforeAdjustment'>")
+    assert [(t.name, t.id, t.state) for t in read(table(inner, named, stated, name="outer")).tables] == [
+        ("Points of channel 1", "1", ""),
+        ("inner", "2", ""),
+        ("Points of channel 1", "3", "as found"),
     ]
+    outer = table(stated, name="outer").replace("<dcc:list ", "<dcc:list refType='x_afterAdjustment' ", 1)
+    assert [t.state for t in read(outer).tables] == ["as left"], "that of the list around it counts"
+    for inside, state in ((inner, None), (stated, "as found")):
+        columns = inside.replace("</dcc:list>", listed("b", "3 4") + "</dcc:list>")
+        assert {item.to_json()["state"] for item in items_of(read(table(columns, name="outer")))} == {state}
+
+
+def test_of_a_name_only_what_can_be_printed_is_read() -> None:
+    inner = table(listed("a", "1 2")).replace(
+        "<dcc:list id='t'>", "<dcc:list><dcc:name><dcc:content>in\u200bn&#xad;e&#x7f;r</dcc:content></dcc:name>"
+    )
+    assert [found.name for found in read(inner).tables] == ["inner"]
 
 
 CONTENTS = "<dcc:content{}>D</dcc:content><dcc:content{}>E</dcc:content><dcc:content{}>F</dcc:content>"

@@ -37,23 +37,28 @@ def test_a_signature_is_good_by_the_trusted_laboratory_alone(xades: bool) -> Non
     unknown = read(signed)
     assert unknown.signature == "not checked"
     assert "--trust-dcc" in unknown.unchecked[0]
-    with pytest.raises(NotAuthenticError, match="CN=Thermolab Example, which is not trusted"):
+    with pytest.raises(NotAuthenticError, match="CN=Thermolab Example, which is not trusted") as refused:
         read(signed, other.certificate)
+    assert refused.value.hint == "Name the laboratory's certificate or its CA: --trust-dcc CERT.pem"
 
 
 def test_a_changed_certificate_is_refused_regardless_of_trust() -> None:
     lab = signer()
     forged = changed(lab.sign(ANGLE), ("91.6", "81.6"))
     for trusted in ((), (lab.certificate,)):
-        with pytest.raises(NotAuthenticError, match=r"signature of c\.xml is bad"):
+        with pytest.raises(NotAuthenticError, match=r"signature of c\.xml is bad") as refused:
             read(forged, *trusted)
+        assert refused.value.hint == (
+            "The file was changed after it was signed, or another key signed it. Ask the laboratory for it again."
+        )
 
 
 def test_a_signature_cannot_be_left_out_if_one_is_required() -> None:
     lab = signer()
     assert read(ANGLE).unchecked == ("The certificate has no signature.",)
-    with pytest.raises(NotAuthenticError, match="has no signature"):
+    with pytest.raises(NotAuthenticError, match="has no signature") as refused:
         read(ANGLE, lab.certificate)
+    assert refused.value.hint == "Ask the laboratory for a signed certificate, or omit --trust-dcc."
     signed = lab.sign(ANGLE)
     bare = changed(signed, ("http://www.w3.org/2001/04/xmldsig-more#ecdsa-sha256", "urn:unknown"))
     assert "cannot be checked" in read(bare).unchecked[0]
@@ -136,8 +141,9 @@ def test_two_signatures_or_too_many_references_are_refused_if_one_is_required() 
 
 
 def test_a_file_that_holds_no_certificate_is_named_as_such() -> None:
-    with pytest.raises(BadDataError, match="no certificate in PEM"):
+    with pytest.raises(BadDataError, match="no certificate in PEM") as refused:
         read(ANGLE, b"-----BEGIN NOTHING-----")
+    assert refused.value.hint == "It begins with -----BEGIN CERTIFICATE-----."
 
 
 @pytest.mark.parametrize(("use", "good"), [("sign", True), ("commit", True), ("", True), ("encipher", False)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import pytest
@@ -232,6 +233,29 @@ def test_a_tedsid_with_a_width_that_is_none_gives_tuples_of_one_length_octet_aga
     for width in (0, 5, 255):
         octets = frame(bytes.fromhex(f"0304000c01{width:02x} 040100 050161"))
         assert teds.recompose(teds.decode(octets)) == octets, width
+
+
+def test_octets_in_a_structure_that_form_no_tuple_are_kept() -> None:
+    octets = frame(bytes.fromhex("030400030101 1204 280100 29"))
+    assert teds.decode(octets).get("DatModel") == 0
+    assert teds.recompose(teds.decode(octets)) == octets
+
+
+def test_a_tuple_of_one_length_octet_has_at_most_255_octets() -> None:
+    for length, width in ((255, 1), (256, 2), (65535, 2)):
+        octets = teds.compose(1, {**META, "200": bytes(length)})
+        assert teds.decode(octets).fields[-1].raw == bytes(length)
+        assert octets[9] == width, length
+    for length, width in ((256, 1), (65536, 2), (65536, None)):
+        with pytest.raises(BadDataError, match=f"Field 200 of MetaTEDS has {length} octets and does not fit"):
+            teds.compose(1, {**META, "200": bytes(length)}, width=width)
+
+
+def test_of_two_fields_of_one_name_the_first_counts_depth_first() -> None:
+    inner = teds.Field(2, "x", 1, b"\1", 0)
+    fields = (teds.Field(1, "a", None, b"", 0, (inner,)), teds.Field(3, "x", 2, b"\2", 0))
+    decoded = replace(teds.decode(octets_of("x07_meta")), fields=fields)
+    assert (decoded.field("x"), decoded.get("x"), decoded.field("y")) == (inner, 1, None)
 
 
 def test_numpy_numbers_are_numbers() -> None:

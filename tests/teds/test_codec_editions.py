@@ -60,10 +60,11 @@ def test_a_uuid_cannot_be_expressed_in_the_other_edition() -> None:
 def test_times_before_1970_and_after_2106() -> None:
     octets = teds.compose(5, {"LstCalDt": -5, "OError": 0.5})
     decoded, findings = to(octets, 2024)
-    assert [finding.field for finding in findings if finding.code == "lost"] == ["LstCalDt"]
+    assert [(f.severity, f.code, f.field) for f in findings] == [("error", "lost", "LstCalDt")]
+    assert findings[0].message.endswith(" It is left out.")
     assert decoded.get("OError") == 0.5
     octets = teds.compose(5, {"LstCalDt": 1 << 33}, edition=2024)
-    assert [finding.code for finding in to(octets, 2007)[1]] == ["lost"]
+    assert [(finding.severity, finding.code) for finding in to(octets, 2007)[1]] == [("error", "lost")]
 
 
 @pytest.mark.parametrize("edition", [2007, 2024])
@@ -84,7 +85,7 @@ def test_nanoseconds_beyond_a_second_are_kept_and_warned_about() -> None:
 
 def test_sub_family_is_lost() -> None:
     octets = teds.compose(12, {"Format": 0, "TCName": "x", "TEDSID": {"subfamily": 4}}, edition=2024)
-    assert [finding.code for finding in to(octets, 2007)[1]] == ["lost"]
+    assert [(finding.severity, finding.code) for finding in to(octets, 2007)[1]] == [("error", "lost")]
 
 
 def test_classes_that_2007_does_not_have() -> None:
@@ -156,6 +157,7 @@ def directory(length: int) -> bytes:
         (b"<a/>\xff\xff", 6, {"text-checksum"}),
         (b"<a/>\xff\xff", 4, {"text-length", "text-checksum"}),
         (b"\x80\x04<a/>\x81\x02\0\0", 4, {"text-tagged"}),
+        (b"\x80\x00\x04<a/>\x81\x00\x02\0\0", 4, {"text-tagged"}),
         (b"<a/>", 99, {"text-length"}),
     ],
 )

@@ -73,6 +73,19 @@ def test_keys_of_other_people_in_every_form(written: bytes, form: str) -> None:
     assert (key.form, key.point) == (form, POINT)
 
 
+def test_white_space_about_a_key_and_headers_of_a_pem_are_no_part_of_it() -> None:
+    for written, form in ((PEM, "pem"), (SPKI.hex().encode(), "hex"), (base64.b64encode(SPKI), "base64")):
+        assert teds.read_key(b" \r\n" + written + b"\n ") == teds.read_key(written)
+        assert teds.read_key(written).form == form
+    first, rest = PEM.split(b"\n", 1)
+    assert teds.read_key(first + b"\nComment: mine\nX-Y: 1\n\n" + rest) == teds.read_key(PEM)
+
+
+@pytest.mark.parametrize(("written", "form"), [("AAAAAAA=", "base64"), ("QUJDRA==", "base64"), ("QUJD", "raw")])
+def test_a_short_word_is_octets_and_no_base64(written: str, form: str) -> None:
+    assert teds.read_key(written).form == form
+
+
 @pytest.mark.parametrize(
     ("octets", "form"),
     [

@@ -322,7 +322,9 @@ def test_what_is_not_stated_is_skipped_unless_something_else_is_short() -> None:
     assert only("range >= 1 deg, low <= 0 deg, angle >= 360 deg", silent) == Fit(
         1, "angle", "skipped", "range is not stated; low is not stated."
     )
-    assert only("rate >= 1 Hz", angle(timing=replace(angle().channels[0].timing, period=0.0))).result == "skipped"
+    for period in (0.0, -1.0):
+        odd = angle(timing=replace(angle().channels[0].timing, period=period))
+        assert [only(f"rate {sign} 1 Hz", odd).result for sign in (">=", "<=")] == ["skipped", "skipped"]
     late = datetime(2027, 1, 2, tzinfo=UTC)
     assert only("angle >= 360 deg", angle(), late).result == "passed", "only an uncertainty ends with its calibration"
 

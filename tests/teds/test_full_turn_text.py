@@ -27,6 +27,7 @@ def channel(low: float, high: float, display: str = "degree") -> Channel:
         (0.0, "degree", TURN - 1e-9, "0 °"),
         (0.0, "degree", TURN - 1e-3, "359.943 °"),
         (0.0, "degree", 0.0, "0 °"),
+        (0.0, "degree", -0.0, "0 °"),
         (0.0, "rad", TURN - 1e-9, "0 rad"),
         (0.0, "rad", 6.2831, "6.2831 rad"),
         (-math.pi, "degree", math.pi - 1e-9, "-180 °"),

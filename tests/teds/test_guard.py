@@ -628,3 +628,24 @@ def test_a_result_that_rises_where_it_must_fall_says_so(tactile: Profile) -> Non
 def test_coefficients_without_points_have_no_residuals(tactile: Profile) -> None:
     calibrations = {1: force_line(uncertainty=0.1)}
     assert said(built(tactile, calibrations[1]), None, tactile, calibrations=calibrations) == []
+
+
+@pytest.mark.parametrize(
+    ("direction", "inputs", "step"),
+    [("decreasing", 3.0, 5.0), ("increasing", 2.0, -1.0), ("either", 2.0, -1.0)],
+)
+def test_the_largest_step_the_wrong_way(direction: str, inputs: float, step: float) -> None:
+    results = np.array([0.0, 1.0, 0.5, -0.5, 4.5])
+    curve: Any = SimpleNamespace(steps=np.diff(results), axes=(np.arange(5.0),), net=4.5)
+    assert Curve.worst_step(curve, direction) == ((inputs,), step)
+
+
+def test_a_set_point_and_a_channel_of_no_width_have_no_share_of_a_range_to_change_by(tactile: Profile) -> None:
+    gripper = load_profile("gripper", [shipped_profiles()])
+    before, after = (read_calibrations(f"# channel: 1\n0,0\n{end},110\n", "x.csv", gripper) for end in (4095, 2000))
+    old = gripper.build(UUID, calibration=before).blocks
+    found = check_calibration(gripper.build(UUID, calibration=after).blocks, old, gripper)
+    assert codes(found, "warning") == set()
+    flat = teds.compose(3, {"PhyUnits": parse_unit("N").units, "LowLimit": 5.0, "HiLimit": 5.0})
+    old, new = ({**built(tactile, force_line(zero)), (1, 3): flat} for zero in (0.0, 3.0))
+    assert "changed" not in codes(check_calibration(new, old), "warning")

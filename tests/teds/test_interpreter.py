@@ -134,6 +134,20 @@ def test_numbers_are_written_rounded_and_kept_within_what_the_form_can_hold(
     assert SampleReader(form).write(np.array([number])).hex() == octets
 
 
+@pytest.mark.parametrize(
+    ("octets", "seconds"),
+    [
+        ("00000001 1dcd6500", 1.5),
+        ("00000001 9dcd6500", -1.5),
+        ("00000000 80000000", 0.0),
+        ("ffffffff 00000001", 4294967295.000000001),
+    ],
+)
+def test_a_time_of_day_may_lie_before_1970(octets: str, seconds: float) -> None:
+    """The highest bit of the nanoseconds is the sign of the whole."""
+    assert SampleReader(SampleForm(DataModel.TIME_OF_DAY, 8)).raw(bytes.fromhex(octets)).tolist() == [seconds]
+
+
 def test_what_is_no_quantity_is_not_written_and_what_cannot_be_read_is_refused() -> None:
     for form in (SampleForm(4, 1), SampleForm(7, 8)):
         with pytest.raises(BadDataError):
@@ -589,6 +603,17 @@ def test_values_far_beyond_a_turn_find_their_way_back_where_nothing_wraps(
     step = (high - low) / (ends[1] - ends[0])
     assert interpreter.decode(interpreter.encode(values)).value.tolist() == pytest.approx(values.tolist(), abs=step)
     assert interpreter.given == (pytest.approx(low), pytest.approx(high))
+
+
+@pytest.mark.parametrize("values", [[1.0, math.nan], [math.nan, math.nan], [math.nan]])
+def test_no_block_with_a_value_that_is_none_is_sent(values: list[float]) -> None:
+    calibration = fit([(0, 0.0), (65535, 10.0)], "linear", channel=1)
+    interpreter = ChannelInterpreter(
+        sheet_of("tactile-finger-sensor", {1: replace(calibration, unit=parse_unit("N"))}), 1
+    )
+    assert interpreter.encode(1.0) == bytes.fromhex("199a")
+    with pytest.raises(BadDataError, match=r"^A value of channel 1 is not finite\.$"):
+        interpreter.encode(np.array(values))
 
 
 def test_a_refused_set_point_is_stated_in_the_unit_that_was_written() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,7 +15,7 @@ import pytest
 
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.teds import plot
-from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
+from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations, residuals
 from teds_provision.teds.plot import plot_blocks
 from teds_provision.teds.profile import load_profile, shipped_profiles
 from teds_provision.teds.units import parse_unit
@@ -132,6 +133,22 @@ def test_a_picture_names_the_node(tmp_path: Path) -> None:
     assert UUID.hex() in drawn
 
 
+def test_the_title_of_a_picture_is_name_and_uuid_or_the_one_that_the_node_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles: list[str] = []
+    monkeypatch.setattr(plot, "_picture", lambda _panels, _kind, title: titles.append(title) or b"")
+    angle = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+    made = read_calibrations("0,0\n65535,360\n", "x.csv", angle)
+    blocks = dict(angle.build(UUID, calibration=made, name="slew").blocks)
+    plot_blocks(blocks, tmp_path / "x.SVG")
+    del blocks[0, 12]
+    plot_blocks(blocks, tmp_path / "x.svg")
+    del blocks[0, 1]
+    plot_blocks(blocks, tmp_path / "x.png")
+    assert titles == [f"slew  {UUID.hex()}", UUID.hex(), ""]
+
+
 def test_a_thinned_curve_is_drawn_from_its_first_point_to_its_last() -> None:
     mask = np.ones(10_001, dtype=bool)
     mask[:3] = False
@@ -200,7 +217,12 @@ def test_each_part_of_a_picture_is_where_it_belongs(finger) -> None:  # type: ig
         [(pytest.approx(-0.2),), (pytest.approx(0.2),)],
     )
     caption = lower.text("set_title")
-    assert caption.startswith("residuals: largest 0.0")
+    largest, rms = map(float, re.findall(r"residuals: largest ([0-9.]+), rms ([0-9.]+);", caption)[0])
+    left = residuals(calibrations[1])
+    assert left is not None
+    deviations = [abs(difference) for difference in left.differences]
+    assert largest == pytest.approx(max(deviations), rel=1e-2)
+    assert rms == pytest.approx(float(np.sqrt(np.mean(np.square(deviations)))), rel=1e-2)
     assert caption.endswith("; stated uncertainty 0.2 (dashed)")
     exact = read_calibrations("# channel: 1\n0,0\n65535,10\n", "x.csv", finger)
     _, lower = drawn(finger.build(UUID, calibration=exact).blocks, exact)

@@ -32,7 +32,7 @@ from teds_provision.teds.profile import (
     shipped_profiles,
     template,
 )
-from teds_provision.teds.profile.load import files_digest, parse_profile
+from teds_provision.teds.profile.load import files_digest, listed, parse_profile
 from teds_provision.teds.profile.model import CalibrationDemand
 from teds_provision.teds.profile.reader import key_lines
 from teds_provision.teds.show import describe
@@ -162,6 +162,18 @@ def test_a_broken_profile_is_listed_with_its_error(tmp_path: Path) -> None:
     (entry,) = list_profiles([tmp_path])
     assert entry.profile is None
     assert "broken.toml:1" in entry.error
+    file = str(tmp_path / "broken.toml")
+    assert listed(entry) == {"name": "broken", "file": file, "error": entry.error}
+    write(tmp_path, "broken", 'links = ["nfc", "can"]\n' + GOOD)
+    (entry,) = list_profiles([tmp_path])
+    assert listed(entry) == {
+        "name": "broken",
+        "title": "Force",
+        "file": file,
+        "abstract": False,
+        "links": ["nfc", "can"],
+        "channels": 1,
+    }
 
 
 def test_an_unknown_profile_is_not_found_and_the_nearest_is_named() -> None:
@@ -207,8 +219,15 @@ def test_a_uuid_of_the_wrong_length_and_a_foreign_channel_are_refused(tmp_path: 
     profile = load_profile(write(tmp_path, "force", GOOD))
     with pytest.raises(BadDataError, match="10 octets"):
         profile.build(bytes(16))
-    with pytest.raises(BadDataError, match="channel 2"):
+    with pytest.raises(BadDataError) as refused:
         profile.build(UUID, calibration={2: fit([(0, 0.0), (1, 1.0)], "linear", channel=2)})
+    assert refused.value.message == "The calibration is for channel 2; force has channel 1 only."
+    assert refused.value.hint.endswith("or --no-calibration to drop the one that the node has.")
+    base = load_profile(write(tmp_path, "base", "abstract = true\n" + GOOD))
+    with pytest.raises(BadDataError) as refused:
+        base.build(UUID)
+    assert refused.value.message == "The profile base is only a base for others."
+    assert refused.value.hint == "Use a profile that extends it; see profile list."
     built = profile.build(UUID, edition=2024)
     assert "six zero octets" in built.warnings[0]
     assert teds.decode(built.blocks[0, 1]).get("UUID") == bytes(6) + UUID
@@ -326,11 +345,16 @@ def test_a_number_that_is_no_data_model_is_named(tmp_path: Path) -> None:
 
 
 def test_the_narrower_selection_of_channels_wins(tmp_path: Path) -> None:
-    text = GOOD.replace("[channel.1]", "[channel.all]").replace('"force"', '"f {channel}"')
+    text = GOOD.replace("[channel.1]", "[channel.all]").replace(
+        '"force"', '"f {channel}"\nframe = "{node}/{channel}_{channel}"'
+    )
     text += "[channel.2]\nhigh-limit = 2\n[channel.1-3]\nhigh-limit = 3\n"
     profile = load_profile(write(tmp_path, "many", text))
     assert [channel.high_limit for channel in profile.channels] == [3, 2, 3]
     assert [channel.name for channel in profile.channels] == ["f 1", "f 2", "f 3"]
+    assert [channel.frame for channel in profile.channels] == ["{node}/1_1", "{node}/2_2", "{node}/3_3"]
+    twice = load_profile(write(tmp_path, "twice", text.replace('"f {channel}"', '"{channel} of {channel}"')))
+    assert [channel.name for channel in twice.channels] == ["1 of 1", "2 of 2", "3 of 3"]
 
 
 @pytest.mark.parametrize("circle", [("a",), ("a", "b"), ("a", "b", "c")])
@@ -379,6 +403,24 @@ def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:
         ('unit = "N"\n', "", 5, "channel.1.unit", "missing"),
         ("low-limit = 0", "low-limit = 11", 9, "channel.1.low-limit", "below the high limit"),
         ("low-limit = 0", 'low-limit = "1 mm"', 9, "channel.1.low-limit", "unit of this channel"),
+        (
+            "low-limit = 0",
+            'low-limit = "1 qq"',
+            9,
+            "channel.1.low-limit",
+            '"qq" is not a unit. Write it like "degree",',
+        ),
+        ('"1 kHz"', '"soon"', 14, "channel.1.sampling-period", "'soon' is not a time. Write a number of seconds, or"),
+        ('unit = "N"', 'unit = "qq"', 8, "channel.1.unit", '"qq" is not a unit. Write it like "degree",'),
+        (
+            'unit = "N"',
+            'unit = "N"\ndisplay-unit = "qq"',
+            9,
+            "channel.1.display-unit",
+            '"qq" is not a unit. Write it like "degree",',
+        ),
+        ("bits = 12 }", "bits = 12, qqq = 1 }", 17, "channel.1.sample.qqq", "there is no such key"),
+        ('["trigger"] }', '["trigger"], qqq = 1 }', 18, "channel.1.sampling.qqq", "there is no such key"),
         ("low-limit = 0", "low-limit = nan", 9, "channel.1.low-limit", "Float32"),
         ("low-limit = 0", "low-limit = 1e39", 9, "channel.1.low-limit", "Float32"),
         ("low-limit = 0", f"low-limit = {10**400}", 9, "channel.1.low-limit", "Float32"),

@@ -198,6 +198,13 @@ def test_what_a_profile_cannot_hold_is_at_its_top(tmp_path: Path) -> None:
     assert text == head + meta + "[channel.1]\n" + CHANNEL.partition("\n")[2]
 
 
+def test_a_text_in_several_languages_is_not_held() -> None:
+    texts = [("Text", {"LangCode": code, "Text": "<a/>"}) for code in ("en", "de")]
+    for given, held in ((texts[:1], True), (texts, False)):
+        text, _ = write_profile([TedsBlock(0, 11, teds.compose(11, given))])
+        assert ("[[text]]" in text) is held
+
+
 def test_units_are_spelt_so_that_they_are_read_again() -> None:
     spelt = {
         text: spell(parse_unit(text).units) for text in ("degC", "N", "mm/s", "rpm", "count", "kg*m**2", "%", "1/s")

@@ -82,6 +82,9 @@ def test_the_mean_of_an_angle_is_where_its_samples_are_wherever_that_is(
 def test_with_the_offset_the_sensor_reads_what_it_shall(had: float, reading: float, wanted: float) -> None:
     calibration = replace(LINE, zero_offset=had)
     turn = turn_of(calibration, full_turn=True)
+    backwards = replace(calibration, unit=replace(calibration.unit, scale=-calibration.unit.scale))
+    assert turn_of(backwards, full_turn=True) == turn > 0
+    assert turn_of(backwards, full_turn=False) == math.inf
     offset = offset_for(calibration, reading, wanted, turn)
     assert abs(offset) <= 180
     left = reading - calibration.zero_offset + offset - wanted
