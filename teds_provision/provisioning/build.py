@@ -222,7 +222,7 @@ def _numbered(station: Station, uuid: bytes, pattern: str) -> str:
     while True:
         name = pattern.replace(_COUNT, str(number))
         owners = station.nodes.all_named(name)
-        if name == mine or not owners or owners == [uuid]:
+        if not owners or owners == [uuid]:
             break
         number += 1
     if mine is not None and mine != name:

@@ -372,7 +372,7 @@ def _with_lines(text: str, *, inside: bool) -> Iterator[tuple[int, Any]]:
         while text[at] != "}":
             key, at = decoder.raw_decode(text, at)
             at = skip(at)
-            start = at if key == "whitelist" else start  # of two equal names, json uses the last
+            start = at if key == "whitelist" else start
             _, at = decoder.raw_decode(text, at)
             at = skip(at)
         assert start is not None

@@ -13,6 +13,7 @@ from teds_provision.measure.matching import NodeMatch, survey
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.virtual import VirtualNode
+from teds_provision.provisioning import adoption
 from teds_provision.provisioning.adoption import (
     FactoryDatasheet,
     NotAdoptedError,
@@ -354,3 +355,10 @@ def test_a_reason_is_asked_for_by_the_first_error_and_kept_with_all_of_them(stat
     ]
     with pytest.raises(NotAdoptedError, match="brought its own datasheet, which is not approved for signing yet"):
         refuse_adoption(brought)
+
+
+@pytest.mark.parametrize(("code", "lines"), [(130, True), (131, True), (12, False), (3, False)])
+def test_only_origin_and_certificate_have_several_lines(code: int, lines: bool) -> None:
+    assert adoption._is_shown("one\ntwo\n", (0, code)) is lines
+    assert adoption._is_shown("one two", (0, code))
+    assert not adoption._is_shown("one\x1btwo", (0, code))

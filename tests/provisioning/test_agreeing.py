@@ -10,9 +10,19 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import GarbledError, NodeSilentError, NotWhitelistedError, PolicyError
+from teds_provision.errors import (
+    BadDataError,
+    GarbledError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    PolicyError,
+    TedsProvisionError,
+)
 from teds_provision.links import LinkSettings
-from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning import agree as agreeing
 from teds_provision.provisioning.agree import (
@@ -29,7 +39,7 @@ from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.station.store.records import TrustRecord, WhitelistEntry
 from tests.bench import Board, make_station, talk
 
 from .test_provision import run as provisioned
@@ -172,8 +182,9 @@ def test_a_datasheet_of_another_owner_refuses_unless_a_key_of_the_node_is_held(
     with closing(make_station(tmp_path / "other", "other")) as other:
         for state, teds in ((NodeState.FACTORY, image.security), (NodeState.PROVISIONED, b"")):
             require_own_ca(other, board.uuid, state, teds)
-        with pytest.raises(PolicyError) as refused:
-            require_own_ca(other, board.uuid, NodeState.PROVISIONED, image.security)
+        for state in (NodeState.KEYED, NodeState.PROVISIONED):
+            with pytest.raises(PolicyError) as refused:
+                require_own_ca(other, board.uuid, state, image.security)
         assert refused.value.message == (
             f"Node {board.uuid.hex()} belongs to another owner's CA: station {fingerprint(station.point)[:16]} signed"
             " its datasheet."
@@ -224,3 +235,111 @@ def test_a_reset_whose_reply_was_lost_is_proven_afterwards(
     assert (line.outcome, line.detail) == ("done", facts)
     with talk(board) as node:
         assert proof_of_reset(node, who.point).proof != receipt.proof, "another challenge"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [BadDataError("It is damaged."), NodeRefusedError("No.", reason=3), NodeSilentError("It is silent.")],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_node_that_shows_no_datasheet_outside_a_session_gives_no_more_than_a_hint(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, error: TedsProvisionError
+) -> None:
+    def fail(*_: object) -> bytes:
+        raise error
+
+    monkeypatch.setattr(agreeing, "read_block", fail)
+    with talk(board) as node:
+        assert agreeing._shown_security(node) == b""
+        assert agreeing._shows_another_key(station, node) is None
+        node.identity = replace(node.identity, epoch=2)
+        assert agreed_elsewhere(station, node) == (
+            "it reports key epoch 2, after 0 here: keyed elsewhere by tap or rotated by another holder (unverified)"
+        )
+
+
+@pytest.mark.parametrize(
+    ("signed", "trusted", "certified", "words"),
+    [
+        (True, True, False, "its datasheet is signed by north ({})"),
+        (True, False, True, "its datasheet is signed by station {}, which your CA certified"),
+        (True, False, False, "which station did so will show once it signs the datasheet"),
+        (False, True, True, "which station did so will show once it signs the datasheet"),
+    ],
+)
+def test_only_a_datasheet_that_is_trusted_names_the_station_that_keyed_a_node(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, signed: bool, trusted: bool, certified: bool,
+    words: str,
+) -> None:  # fmt: skip
+    other = SoftwareKey(201).point
+    shown = SimpleNamespace(station_key=other, node_key=None)
+    monkeypatch.setattr(agreeing, "security", SimpleNamespace(decode=lambda _octets: shown))
+    monkeypatch.setattr(agreeing, "signature_good", lambda *_: signed)
+    monkeypatch.setattr(agreeing, "station_signature_good", lambda _shown, ca: certified and ca == station.ca)
+    if trusted:
+        station.policy.trust(TrustRecord("north", "station", other, fingerprint(other)))
+    station.pins.put(WhitelistEntry(board.uuid, "ab" * 32))
+    with talk(board) as node:
+        node.identity = replace(node.identity, epoch=2)
+        assert agreed_elsewhere(station, node).endswith(f"(unverified); {words.format(fingerprint(other)[:16])}")
+        assert agreeing._shows_another_key(station, node) is None, "it shows no key"
+
+
+@pytest.mark.parametrize(
+    ("error", "goes_on"),
+    [
+        (NodeRefusedError("It does not know the key.", reason=Reason.UNKNOWN_KEY), True),
+        (NodeRefusedError("It has no key.", reason=Reason.WRONG_STATE), True),
+        (NotAuthenticError("Its proof is wrong."), True),
+        (NodeRefusedError("It is busy.", reason=Reason.BUSY), False),
+        (NodeSilentError("It is silent."), False),
+    ],
+    ids=str,
+)
+def test_the_next_key_is_tried_if_the_node_does_not_know_the_first(
+    station: Station, monkeypatch: pytest.MonkeyPatch, error: TedsProvisionError, goes_on: bool
+) -> None:
+    tried: list[object] = []
+
+    def open_(key: object, *, statics: tuple[bytes, ...]) -> None:
+        assert statics == (station.point,)
+        tried.append(key)
+        if key == "first":
+            raise error
+
+    held = [SimpleNamespace(key=name) for name in ("first", "second", "third")]
+    node: Any = SimpleNamespace(uuid=bytes(10), tapped=True, open=open_)
+    monkeypatch.setattr(type(station.keys), "unwrapped", lambda *_: held)
+    monkeypatch.setattr(agreeing, "_take_up", lambda _station, _node, opened: opened)
+    if goes_on:
+        assert agreeing.open_session(station, node) is held[1]  # type: ignore[comparison-overlap]
+    else:
+        with pytest.raises(type(error)):
+            agreeing.open_session(station, node)
+    assert tried == ["first", "second"][: 1 + goes_on]
+
+
+@pytest.mark.parametrize(
+    ("entry", "due", "held", "anew"),
+    [
+        (WhitelistEntry(bytes(10), "ab" * 32), True, True, True),
+        (WhitelistEntry(bytes(10), "ab" * 32), False, True, False),
+        (WhitelistEntry(bytes(10), None), True, True, False),  # no key to hold it against: a rotation would take any
+        (None, True, True, False),
+        (WhitelistEntry(bytes(10), "ab" * 32), True, False, False),
+    ],
+)
+def test_a_key_that_is_due_is_rotated_at_a_node_whose_identity_key_is_known(
+    station: Station, monkeypatch: pytest.MonkeyPatch, entry: WhitelistEntry | None, due: bool, held: bool, anew: bool
+) -> None:
+    agreed: list[object] = []
+    node: Any = SimpleNamespace(uuid=bytes(10))
+    monkeypatch.setattr(agreeing, "open_session", lambda *_: "held" if held else None)
+    monkeypatch.setattr(type(station.pins), "entry", lambda *_: entry)
+    monkeypatch.setattr(type(station.keys), "rotates_now", lambda *_: due)
+    monkeypatch.setattr(type(station.keys), "unwrapped", lambda *_: ["new", "old"])
+    monkeypatch.setattr(agreeing, "read_block", lambda *_: b"teds")
+    monkeypatch.setattr(agreeing, "_agree_anew", lambda *given: agreed.append(given[2:]))
+    found = agreeing.session_if_keyed(station, node)
+    assert found == ("new" if anew else "held" if held else None)  # type: ignore[comparison-overlap]
+    assert agreed == ([(entry, station.ca, b"teds")] if anew else [])

@@ -243,8 +243,11 @@ def test_a_sheet_ends_after_its_last_row_and_with_watch_once_all_have_passed(
     station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, watch: bool, ended: list[tuple[int, str]]
 ) -> None:
     run = of_sheet(station, tmp_path, "name\na\nb\n", watch=watch)
+    renewed: list[int] = []
+    monkeypatch.setattr(run.stop, "renew", lambda: renewed.append(run.ended))
     assert taps(monkeypatch, run, (1, "It was pulled."), (2, None), (1, None), (4, None)) == ended
     assert (run.passed, len(run), run.ended) == (sum(result == "passed" for _, result in ended), 2, len(ended))
+    assert len(renewed) == len(ended), "after each board the next one has the whole time"
 
 
 def test_a_row_that_another_reader_works_on_is_not_given_to_a_second_board(station: Station, tmp_path: Path) -> None:

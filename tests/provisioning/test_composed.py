@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.provisioning import build as step
 from teds_provision.provisioning.build import (
     BuildOrder,
@@ -27,6 +27,7 @@ from teds_provision.provisioning.build import (
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft
 from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile import load_profile
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 FINGER = "tactile-finger-sensor"
@@ -353,3 +354,34 @@ def test_of_a_datasheet_that_stays_those_teds_alone_change_that_are_named(
             (2, 5): b"added", (3, 3): b"own",
         }  # fmt: skip
         assert (found.named, found.warnings, found.profile_digest) == (True, ("w",), None)
+
+
+def test_a_node_keeps_the_number_that_it_has_though_another_one_has_it_too(station: Station) -> None:
+    other, third = bytes(9) + b"\1", bytes(9) + b"\2"
+    for uuid, name in ((UUID, "hand 1"), (other, "hand 1"), (third, "hand x")):
+        station.nodes.remember(uuid, name=name)
+    assert [step._numbered(station, uuid, "hand {n}") for uuid in (UUID, other, third)] == [
+        "hand 1",
+        "hand 1",
+        "hand 2",
+    ]
+    station.nodes.remember(other, name="hand 7")
+    assert step._numbered(station, other, "hand {n}") == "hand 7"
+    assert step._numbered(station, other, "{n} hand") == "1 hand"
+
+
+def test_what_an_order_names_is_read_within_bounds_and_records_nothing(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile, given = load_profile(FINGER), list[Any]()
+    large = tmp_path / "large.pem"
+    large.write_bytes(bytes((1 << 20) + 1))
+    with pytest.raises(BadDataError, match="1048576 octets, which is too large for a cert"):
+        step._from_file(replace(order(tmp_path), trusted=(large,)), profile)
+    for missing in (tmp_path, tmp_path / "nowhere.csv"):
+        with pytest.raises(NotFoundError) as refused:
+            prepare(station, BuildOrder(FINGER, calibration=missing), UUID)
+        assert refused.value.message == f"There is no calibration file {missing}."
+    monkeypatch.setattr(step, "guard", lambda *words, **how: (given.append((words[2:4], how)), ("guarded",))[1])
+    assert prepare(station, order(tmp_path, channel=1, accept_calibration="a reason"), UUID).warnings == ("guarded",)
+    assert given == [((None, "a reason"), {"record": False})]

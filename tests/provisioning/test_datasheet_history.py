@@ -261,3 +261,20 @@ def test_the_plan_for_a_node_whose_datasheet_is_unknown_lists_every_teds(
     with pytest.raises(NotFoundError) as unknown:
         restored(station, RestoreOrder(board.uuid.hex(), 1, dry_run=True))
     assert unknown.value.hint == "Known are: none."
+
+
+def test_who_let_the_node_go_and_who_is_asked_about_its_battery_go_to_the_steps(
+    station: Station, board: Board, visits: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Any] = []
+    operator = Operator()
+
+    def write(*_: object, low: object, jump: bool, **__: object) -> Any:
+        given.append((low, jump))
+        raise PolicyError("far enough")
+
+    monkeypatch.setattr(datasheet_history, "require_not_measured", lambda *_, released: given.append(released))
+    monkeypatch.setattr(datasheet_history, "write", write)
+    with pytest.raises(PolicyError, match="far enough"):
+        restored(station, RestoreOrder(board.uuid.hex(), 1), operator)
+    assert given == [False, (operator.low_battery, False)]

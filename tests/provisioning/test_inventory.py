@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Any
 
 import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.provisioning.inventory import NodeFit, fits_of, inventory, require, search
+from teds_provision.provisioning import readings
+from teds_provision.provisioning.inventory import NodeFit, fits_of, inventory, require, search, with_verdicts
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
+from teds_provision.station.store.records import KeyRecord, RevocationRecord, Tombstone, WhitelistEntry
 from teds_provision.teds.fits import Fit, parse_fits
+from teds_provision.teds.image import Image
 from teds_provision.teds.origin import Origin
 from tests.bench import Board
 from tests.handover.desk import provisioned
@@ -116,6 +119,8 @@ def test_how_nodes_are_found(station: Station) -> None:
     assert search(station, state="moved") == [], "no state of Identify"
     station.nodes.remember(two, name=three.hex())
     assert search(station, three.hex()) == [three], "a whole UUID goes before a name"
+    station.nodes.remember(two, name=f"0x{three.hex()}")
+    assert search(station, f" 0x{three.hex()} ") == [three]
     station.nodes.remember(two, name="facade")
     assert search(station, "facade") == [two], "digits that are no whole UUID"
     for text in ("nobody", "ff" * 10):
@@ -172,3 +177,26 @@ def test_a_requirement_that_no_channel_meets_ends_with_its_reasons() -> None:
     assert refused.value.message == 'The channel "grip" does not suffice: too small.'
     with pytest.raises(PolicyError):
         require([good, replace(bad, requirement=named)])
+
+
+def test_a_session_is_missed_at_a_node_whose_key_is_held_and_was_not_given_away(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, moved, bare = (UUID[:-1] + bytes([number]) for number in (1, 2, 3))
+    for uuid in (held, moved, bare):
+        station.nodes.remember(uuid, epoch=1)
+    for uuid in (held, moved):
+        station.keys.add(KeyRecord(uuid, 1, "01" * 8, "active", 1, b"w", "agreement", "2026-01-01T00:00:00Z"))
+    station.policy.put_tombstone(Tombstone(moved, "ab" * 32, "h", "2026-01-01T00:00:00Z"))
+    asked: list[Any] = []
+    monkeypatch.setattr(readings, "verdicts_of", lambda _station, *given: (asked.append(given), {})[1])
+    assert len(list(with_verdicts(station, [held, moved, bare]))) == 3
+    assert asked == [([held, moved, bare], [held])]
+
+
+def test_a_datasheet_without_a_channel_is_as_good_as_none(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    requirement = parse_fits("force >= 1 N")
+    for image in (None, Image(UUID, {})):
+        monkeypatch.setattr(type(station.datasheets), "datasheet", lambda *_, image=image: image)
+        (found,) = fits_of(station, [requirement], [UUID], datetime(2026, 3, 1, tzinfo=UTC))
+        assert (found.fit.result, found.fit.why) == ("skipped", "its datasheet is unknown here.")

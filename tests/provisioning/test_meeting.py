@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -91,6 +92,9 @@ def test_a_uuid_that_answers_twice_costs_its_own_node_alone() -> None:
     (notice,) = notices
     assert (notice.kind, notice.uuid) == ("conflict", UUID)
     assert notice.text.startswith(f"Node {UUID.hex()} answers at 0x21 and at 0x22: one of them is an impostor.")
+    assert notice.text.endswith(
+        " Disconnect one of them, or select one by node=ADDRESS in --can: its key shows which one is genuine."
+    )
     with pytest.raises(AddressConflictError):
         drop_duplicate_uuids([one, twin], notices.append)
 
@@ -334,6 +338,16 @@ def test_the_wait_for_the_next_board_is_over_after_its_time_but_not_while_one_is
     clock.now += 2.0
     assert not both.ran_out, "a person was first"
     assert not IdleStop(None).wait(0.0)
+    waits: list[float] = []
+
+    def wait(_event: threading.Event, seconds: float) -> None:
+        waits.append(round(seconds, 3))
+        clock.now += seconds
+
+    monkeypatch.setattr(threading.Event, "wait", wait)
+    assert not IdleStop(None).wait(0.5)
+    assert waits == [0.2, 0.2, 0.1], "whoever sets it elsewhere is seen soon"
+    assert IdleStop(0.3).wait()
 
 
 def watched(

@@ -346,6 +346,9 @@ def test_what_is_reported_of_several_channels_is_one_sentence() -> None:
     messages = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
     assert merged(messages) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
     assert merged(messages[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)
+    assert merged([*messages[:2], "another", messages[0], "another"]) == (
+        "Channels 1 to 2 have no calibration: raw values cannot be turned into N.", "another",
+    )  # fmt: skip
 
 
 @dataclass

@@ -13,9 +13,11 @@ from teds_provision.provisioning import provision as module
 from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.provisioning.board_type import HardwareCheck
 from teds_provision.provisioning.build import BuildOrder, PreparedOrder
+from teds_provision.provisioning.calibration_guard import guard
 from teds_provision.provisioning.progress import StepResult, Steps
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft
+from teds_provision.teds import guard as guarding
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile import load_profile
 
@@ -245,3 +247,50 @@ def test_hardware_is_asked_about_an_authentic_datasheet_in_the_units_of_its_type
     units = "units of the type" if typed else "units of the store"
     assert (found, asked) == ((borne, [("on node", units)]) if verdict == "authentic" else (HardwareCheck({}), []))
     assert last(run) == ("check", result, detail)
+
+
+@pytest.mark.parametrize(
+    ("typed", "known", "demand"),
+    [("a profile", "other", "its own"), ("a profile without", "other", None), (None, "other", "of other"),
+     (None, None, "of None")],
+)  # fmt: skip
+def test_what_a_type_demands_of_the_firmware_is_that_of_the_ordered_one_else_of_the_nodes(
+    station: Station, monkeypatch: pytest.MonkeyPatch, typed: str | None, known: str | None, demand: str | None
+) -> None:
+    run = a_run(station)
+    if known is not None:
+        station.nodes.remember(UUID, profile=known)
+    profile = None if typed is None else SimpleNamespace(firmware="its own" if typed == "a profile" else None)
+    demands = SimpleNamespace(demand_of=lambda name: f"of {name}")
+    monkeypatch.setattr(module, "FirmwareDemands", lambda _home: demands)
+    assert run._firmware_demand(WHO, SimpleNamespace(profile=profile)) == demand
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected", "message"),
+    [
+        (1, (), "The calibration is refused: channel 1: it is harmful."),
+        (3, ("harmful",), "The calibration is refused: channel 1: it is harmful (and 2 more)."),
+    ],
+)
+def test_a_calibration_with_errors_needs_a_reason_and_its_errors_are_always_named(
+    station: Station, monkeypatch: pytest.MonkeyPatch, errors: int, expected: tuple[str, ...], message: str
+) -> None:
+    def finding(channel: int, severity: str) -> Any:
+        code = "harmful" if severity == "error" else "overdue"
+        return SimpleNamespace(channel=channel, severity=severity, code=code, message=f"it is {code}.".rstrip("."))
+
+    found = [finding(number + 1, "error") for number in range(errors)] + [finding(9, "warning")]
+    monkeypatch.setattr(guarding, "check_calibration", lambda *_, **__: found)
+    image = Image(UUID, {(1, 5): b"calibration"})
+    with pytest.raises(PolicyError) as refused:
+        guard(station, image, None, None, expected=expected)
+    assert (refused.value.message, "--accept-calibration" in refused.value.hint) == (message, True)
+    warned = guard(station, image, None, "a reason", expected=(*expected, "overdue"))
+    numbers = ["Channel 1: it is harmful"] if errors == 1 else ["Channels 1 to 3: it is harmful"]
+    assert [text.lower() for text in warned] == [text.lower() for text in numbers]
+    (line,) = [entry for entry in station.audit_log.entries() if entry.act == "accept-calibration"]
+    assert line.detail["why"] == "a reason"
+    assert len(line.detail["findings"]) == errors
+    guard(station, image, None, "a reason", record=False)
+    assert len([entry for entry in station.audit_log.entries() if entry.act == "accept-calibration"]) == 1

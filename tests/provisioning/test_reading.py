@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision.errors import BadDataError, GarbledError, NodeRefusedError
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.frames import Command, Reason, Reply, refusal
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.provisioning import read as read_module
 from teds_provision.provisioning import teds_read
 from teds_provision.provisioning.conversation import refused
+from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.teds_read import LARGEST_SECURITY, read_block
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
@@ -235,3 +241,44 @@ def test_the_security_teds_of_a_node_that_was_written_is_read_in_its_session(sta
     assert node.asked[0] == "to identify itself"
     teds_read.take_snapshot(node)  # type: ignore[arg-type]
     assert node.asked.count("to identify itself") == 1, "it has proved it in this session"
+
+
+def test_the_time_of_a_whole_image_is_bounded_not_that_of_each_teds(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[float | None] = []
+
+    def read_block(_node: object, _block: object, *, until: float | None = None) -> bytes:
+        limits.append(until)
+        return b"teds"
+
+    monkeypatch.setattr(teds_read, "read_block", read_block)
+    monkeypatch.setattr(teds_read, "time", SimpleNamespace(monotonic=iter((1000.0, 1500.0)).__next__))
+    teds_read.read_image(Lister({}), listed=[(0, 1), (0, 2), (0, 3)])  # type: ignore[arg-type]
+    assert limits == [1300.0] * 3
+
+
+UUID = bytes(10)
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_only_what_is_read_in_a_session_is_kept(monkeypatch: pytest.MonkeyPatch, sealed: bool) -> None:
+    kept: list[Any] = []
+    node = SimpleNamespace(open_counter=b"c", sealed=sealed, proven="proven")
+
+    @contextmanager
+    def at_node(*_: object, **__: object) -> Iterator[Any]:
+        yield SimpleNamespace(node=node, who=SimpleNamespace(point=b"point"))
+
+    for name, found in {
+        "at_node": at_node, "open_or_say_why": lambda *_: "", "read_image": lambda _node: "image",
+        "provenance_check": lambda *_: SimpleNamespace(result="passed"),
+        "freshness_floor_of": lambda *given: given[1:],
+        "keep": lambda *words, **how: kept.append((words[1:], how)),
+    }.items():  # fmt: skip
+        monkeypatch.setattr(read_module, name, found)
+    station: Any = SimpleNamespace(
+        nodes=SimpleNamespace(resolve=lambda _text: UUID), durable=lambda _why: nullcontext()
+    )
+    report = read_module.read_at(station, LinkSettings(), "finger", SilentReporter())
+    assert (report.image, report.error) == ("image", None)  # type: ignore[comparison-overlap]
+    how = {"by": "read", "floor": (UUID, "proven"), "c": b"c"}
+    assert kept == ([((node, "image"), how)] if sealed else [])

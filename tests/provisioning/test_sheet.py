@@ -792,3 +792,22 @@ def test_a_sheet_has_at_most_ten_thousand_rows(
     assert len(read(station, tmp_path, f"uuid,name\n{lines}\n").rows) == 3
     with pytest.raises(BadDataError, match=r"boards\.csv:5: there are more than 3 rows\."):
         read(station, tmp_path, f"uuid,name\n{lines},b\n,c\n,d\n")
+
+
+@pytest.mark.parametrize("by_order", [True, False])
+def test_a_row_in_the_order_of_taps_is_given_to_one_board_by_two_runs_of_a_sheet(
+    station: Station, tmp_path: Path, by_order: bool
+) -> None:
+    sheet = read(station, tmp_path, "name\na\n" if by_order else f"fingerprint,name\n{'ab' * 32},a\n")
+    (row,) = sheet.rows
+    first, second = Progress(station.home, sheet), Progress(station.home, sheet)
+    first.assign_row(row, board_of(1))
+    if by_order:
+        with pytest.raises(NodeBusyError) as refused:
+            second.assign_row(row, board_of(2))
+        assert refused.value.message == f"Row 1 was assigned to board {board_of(1).hex()} by another run of this sheet."
+        assert refused.value.hint == "Tap this board again to use the next row."
+        assert second.board_of(row) == board_of(1).hex()
+    else:
+        second.assign_row(row, board_of(2))
+        assert Progress(station.home, sheet).board_of(row) == board_of(2).hex(), "the one with that key"

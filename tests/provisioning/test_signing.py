@@ -373,3 +373,29 @@ def test_a_plan_of_a_signature_opens_no_session_that_would_settle_a_key(
     present = signing._read_now(station, node, SignOrder(image.uuid, None, None, dry_run))
     assert opened == ([] if dry_run else [(station, node)])
     assert (present.epoch, present.sequence) == (3, 9)
+
+
+def test_of_two_equal_signatures_that_of_the_node_is_given_back_and_of_others_one_above_its_number(
+    station: Station, image: Image, keys: SignedNodeKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = {b"on node": 5, b"earlier": 9, b"too old": 5, b"other": None}
+    monkeypatch.setattr(signing, "_sequence_if_the_same", lambda *given: numbers[given[3]])
+
+    def signed(on_node: bytes | None, *earlier: bytes) -> int | None:
+        found = signing.sign(station, keys, image, epoch=1, node_sequence=5, on_node=on_node, earlier=earlier)
+        return found.sequence if found.reused else None
+
+    assert signed(b"on node", b"earlier") == 5
+    assert signed(None, b"too old", b"earlier") == 9
+    assert signed(b"other", b"too old") is None
+
+
+def test_the_vault_opens_before_a_node_is_waited_for_and_not_for_a_plan(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course: list[str] = []
+    monkeypatch.setattr(station, "unlock", lambda: course.append("unlocked"))
+    monkeypatch.setattr(signing, "sign_image", lambda *_: course.append("signed"))
+    for dry_run in (False, True):
+        signing.sign_at(station, LinkSettings(), image.uuid.hex(), SilentReporter(), dry_run=dry_run)
+    assert course == ["unlocked", "signed", "signed"]

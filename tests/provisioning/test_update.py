@@ -1399,6 +1399,7 @@ def test_packets_are_no_longer_than_the_board_and_its_messages_take(size: int, g
         (SMPException("bad"), NotAuthenticError, "it lacks what belongs there"),
         (TypeError("bad"), NotAuthenticError, "it lacks what belongs there"),
         (ValueError("bad"), NotAuthenticError, "it lacks what belongs there"),
+        (AssertionError("bad"), NotAuthenticError, "it lacks what belongs there"),
         (RuntimeError("a bug"), RuntimeError, "a bug"),
     ],
 )

@@ -19,6 +19,7 @@ from teds_provision.errors import (
     NodeSilentError,
     NotFoundError,
     PolicyError,
+    TedsProvisionError,
 )
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.frames import Reason
@@ -407,3 +408,57 @@ def test_what_a_person_is_asked_before_an_image_is_written(
     with pytest.raises(PolicyError, match="far enough"):
         writing.write_at(station, LinkSettings(), image.uuid.hex(), reporter, **how)
     assert course == (["jump", "session", "written"] if jump else ["session", *asked, "written"])
+
+
+def test_a_name_that_another_node_has_is_refused_of_a_draft_and_not_of_a_file(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(writing, "own_name", lambda _station, _image, profile: asked.append(profile) or "hand")  # type: ignore[func-returns-value]
+    monkeypatch.setattr(writing, "read_image_file", lambda _path: image)
+    station.datasheets.keep_draft(Draft(image.uuid, image, "signed", None))
+    station.nodes.remember(bytes(9) + b"\1", name="hand")
+    station.nodes.remember(image.uuid, profile="gripper")
+    with pytest.raises(TedsProvisionError, match="hand"):
+        writing._wanted(station, image.uuid, None)
+    assert writing._wanted(station, image.uuid, Path("image.json")) == (image, {"name": "hand"})
+    assert asked == ["gripper", "gripper"], "the profile of the node, if the draft has none"
+
+
+def test_what_the_node_has_already_is_kept_as_written_unless_it_is_known(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[Any] = []
+    node: Any = SimpleNamespace(proven="proven")
+    monkeypatch.setattr(writing, "freshness_floor_of", lambda *given: given[1:])
+    monkeypatch.setattr(writing, "keep", lambda *words, **how: kept.append((words[2], how)))
+    for known in (True, False):
+        monkeypatch.setattr(writing, "is_known", lambda *_, known=known: known)
+        done = writing.write(station, node, image, present=SimpleNamespace(image=image))  # type: ignore[arg-type]
+        assert (done.octets, done.on_node) == (0, image)
+    assert kept == [(image, {"by": "write", "floor": (image.uuid, "proven")})]
+
+
+@pytest.mark.parametrize(
+    ("sequence", "between"),
+    [(5, []), (4 + 65536, []), (4 + 65537, [65540]), (4 + 2 * 65536, [65540]), (4 + 2 * 65536 + 1, [65540, 131076])],
+)
+def test_a_jump_of_the_sequence_goes_in_steps_of_65536(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch, sequence: int, between: list[int]
+) -> None:
+    signed, committed = list[int](), list[Any]()
+    at = Identity(image.uuid, NodeState.PROVISIONED, 1, 4) if False else SimpleNamespace(sequence=4, epoch=1)
+    node: Any = SimpleNamespace(proven=at, open_counter=b"c")
+    monkeypatch.setattr(writing.security, "decode", lambda _octets: SimpleNamespace(signed=True, sequence=sequence))
+    for name in ("_require_newer", "require_charge", "read_firmware", "_after_commit", "_conclude", "node_keys_of"):
+        monkeypatch.setattr(writing, name, lambda *_, **__: None)
+    monkeypatch.setattr(writing, "replace", lambda identity, **_: identity)
+    monkeypatch.setattr(writing, "read_image", lambda *_, **__: image)
+    monkeypatch.setattr(
+        writing, "sign", lambda *_, sequence, **__: (signed.append(sequence), SimpleNamespace(image=sequence))[1]
+    )
+    monkeypatch.setattr(writing, "_commit", lambda _s, _n, made, has, _p: (committed.append((made, has)), 7)[1])
+    other = Image(image.uuid, {SECURITY: b"older"})
+    done = writing.write(station, node, image, present=SimpleNamespace(image=other), jump=True)  # type: ignore[arg-type]
+    assert (signed, done.octets) == (between, 7 * (len(between) + 1))
+    assert committed == list(zip([*between, image], [other, *between], strict=True))
