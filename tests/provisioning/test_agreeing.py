@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -343,3 +344,34 @@ def test_a_key_that_is_due_is_rotated_at_a_node_whose_identity_key_is_known(
     found = agreeing.session_if_keyed(station, node)
     assert found == ("new" if anew else "held" if held else None)  # type: ignore[comparison-overlap]
     assert agreed == ([(entry, station.ca, b"teds")] if anew else [])
+
+
+@pytest.mark.parametrize(
+    ("reason", "state", "demanded", "opens", "fresh"),
+    [
+        (Reason.NOT_PERMITTED, NodeState.FACTORY, False, True, True),
+        (Reason.NOT_PERMITTED, NodeState.FACTORY, False, False, None),
+        (Reason.NOT_PERMITTED, NodeState.FACTORY, True, True, None),
+        (Reason.NOT_PERMITTED, NodeState.KEYED, False, True, None),
+        (Reason.BUSY, NodeState.FACTORY, False, True, None),
+    ],
+)
+def test_a_new_node_that_stored_the_key_of_a_run_that_was_cut_is_opened_with_it(
+    station: Station, monkeypatch: pytest.MonkeyPatch, reason: Reason, state: NodeState, demanded: bool, opens: bool,
+    fresh: bool | None,
+) -> None:  # fmt: skip
+    def refuse(*_: object, **__: object) -> Any:
+        raise NodeRefusedError("It has a key.", reason=reason)
+
+    held = SimpleNamespace(record=SimpleNamespace(epoch=3, key_id="ab" * 8)) if opens else None
+    node: Any = SimpleNamespace(uuid=bytes(10), sealed=False)
+    who: Any = SimpleNamespace(state=state, recalled=False, security_teds=b"teds")
+    monkeypatch.setattr(agreeing, "_pin_for", lambda entry, *_: entry)
+    monkeypatch.setattr(agreeing, "_agree_anew", refuse)
+    monkeypatch.setattr(agreeing, "open_session", lambda *_: held)
+    new_key = partial(agreeing._new_key, station, node, who, WhitelistEntry(bytes(10)), returning=False)
+    if fresh is None:
+        with pytest.raises(NodeRefusedError, match="It has a key"):
+            new_key(demanded=demanded)
+    else:
+        assert new_key(demanded=demanded) == AgreeResult(3, "ab" * 8, fresh=fresh)

@@ -854,3 +854,26 @@ def test_a_row_is_done_already_if_the_board_has_what_the_row_gives(
     with station.transaction():
         station.nodes.put(NodeRecord(uuid_of(2), name="hand"))
     assert not batch._has_it_already(station, hand, uuid), "another node has that name now"
+
+
+@pytest.mark.parametrize(
+    ("whitelisted", "of_the_job", "only_verify", "meant"),
+    [
+        (False, True, False, True),
+        (False, False, False, False),
+        (False, True, True, True),
+        (True, False, True, True),
+        (False, False, True, False),
+    ],
+)
+def test_a_board_of_the_bus_is_meant_if_the_job_or_the_whitelist_lists_it(
+    station: Station, monkeypatch: pytest.MonkeyPatch, whitelisted: bool, of_the_job: bool, only_verify: bool,
+    meant: bool,
+) -> None:  # fmt: skip
+    if whitelisted:
+        station.pins.put(WhitelistEntry(uuid_of(1), assurance="tap"))
+    run = run_of(station, whole_bus=True)
+    run.line = cast(Any, SimpleNamespace(is_listed=lambda uuid: of_the_job and uuid == uuid_of(1),
+                                         only_verify=only_verify, total=0))  # fmt: skip
+    assert run._is_meant(answer(1)) is meant
+    assert not run._is_meant(answer(2))

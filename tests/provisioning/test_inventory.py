@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.provisioning import readings
 from teds_provision.provisioning.inventory import NodeFit, fits_of, inventory, require, search, with_verdicts
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeyRecord, RevocationRecord, Tombstone, WhitelistEntry
@@ -189,7 +189,8 @@ def test_a_session_is_missed_at_a_node_whose_key_is_held_and_was_not_given_away(
         station.keys.add(KeyRecord(uuid, 1, "01" * 8, "active", 1, b"w", "agreement", "2026-01-01T00:00:00Z"))
     station.policy.put_tombstone(Tombstone(moved, "ab" * 32, "h", "2026-01-01T00:00:00Z"))
     asked: list[Any] = []
-    monkeypatch.setattr(readings, "verdicts_of", lambda _station, *given: (asked.append(given), {})[1])
+    judging = SimpleNamespace(verdicts_of=lambda _station, *given: (asked.append(given), {})[1])
+    monkeypatch.setattr("teds_provision.provisioning.inventory.readings", judging)
     assert len(list(with_verdicts(station, [held, moved, bare]))) == 3
     assert asked == [([held, moved, bare], [held])]
 

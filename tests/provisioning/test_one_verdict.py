@@ -28,7 +28,7 @@ from teds_provision.errors import (
 from teds_provision.measure import background_reread
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.verified_session import open_trusted
-from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.provisioning import identify as identify_module
 from teds_provision.provisioning import readings
 from teds_provision.provisioning.agree import require_session
@@ -37,13 +37,20 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.inventory import inventory
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.sign import known_node_keys
-from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify import freshness_floor_of, possession_check, snapshot_trust
+from teds_provision.provisioning.teds_read import read_identity, read_image
+from teds_provision.provisioning.verify import (
+    Signers,
+    _certifier,
+    freshness_floor_of,
+    possession_check,
+    snapshot_trust,
+    snapshot_trust_of,
+)
 from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_at_node, verify_in_session
 from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Check
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import NodeReading, RevocationRecord, utc_now
+from teds_provision.station.store.records import NodeReading, RevocationRecord, TrustRecord, utc_now
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.image import SECURITY, Image
@@ -501,3 +508,65 @@ def test_a_reading_whose_key_another_node_signed_is_no_key_of_this_one(
         with pytest.raises(error) as refused:
             known_node_keys(station, board.uuid)
         assert board.uuid.hex() in str(refused.value)
+
+
+def test_a_datasheet_that_was_read_before_stands_for_one_of_the_same_signature_while_nothing_newer_was_seen(
+    station: Station, board: Board
+) -> None:
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    assert image.security is not None
+    with talk(board) as node:
+        require_session(station, node)
+        floor = freshness_floor_of(station, board.uuid, read_identity(node))
+        for security, bound, found in (
+            (image.security, floor, image),
+            (image.security, replace(floor, sequence=9), None),
+            (image.security, replace(floor, key_epoch=9), None),
+            (image.security + b"x", floor, None),
+        ):
+            assert readings.cached_image_if_current(station, node, security, bound) == found
+
+
+@pytest.mark.parametrize(
+    ("keyed", "result", "why"),
+    [
+        (True, "failed", "its datasheet was last read outside a session"),
+        (False, "skipped", "this station holds no key of this node"),
+    ],
+)
+def test_a_session_is_missed_only_of_a_node_whose_key_is_held(
+    station: Station, board: Board, keyed: bool, result: str, why: str
+) -> None:
+    row = station.datasheets.reading(board.uuid)
+    assert row is not None
+    with talk(board) as node:
+        identify(station, node)
+    assert station.datasheets.reading(board.uuid) == row, "a plain look replaces no reading whose key is known"
+    found = readings._judged(station, replace(row, c=None), keyed=keyed)
+    (check,) = [check for check in found.verified.checks if check.name == "session"]
+    assert (check.result, check.why) == (result, why)
+
+
+def test_a_snapshot_of_some_nodes_has_the_trust_of_the_store(station: Station, board: Board) -> None:
+    north, kept, ban = SoftwareKey(211).point, SoftwareKey(212).point, bytes(9) + b"\1"
+    station.policy.trust(TrustRecord("north", "station", north, fingerprint(north)))
+    station.keys.set_ca_of(board.uuid, kept)
+    station.policy.deny(RevocationRecord(ban, None, "lost", "s"))
+    for snapshot in (snapshot_trust(station), snapshot_trust_of(station, [board.uuid, ban])):
+        assert north in snapshot.policy.trusted_stations()
+        assert snapshot.policy.trusted_stations() == station.policy.trusted_stations()
+        for uuid in (None, board.uuid, ban):
+            assert snapshot.policy.trusted_cas(uuid) == station.policy.trusted_cas(uuid)
+        assert kept in snapshot.policy.trusted_cas(board.uuid)
+        assert snapshot.policy.revocation(ban) == station.policy.revocation(ban)
+        assert snapshot.policy.revocation(board.uuid) is None
+        assert snapshot.pins.by_uuid[board.uuid] == station.pins.pinned(board.uuid)
+
+
+def test_a_ca_that_one_node_keeps_certifies_for_this_node_alone(station: Station, board: Board) -> None:
+    kept, signer = SoftwareKey(213), SoftwareKey(214).point
+    station.keys.set_ca_of(board.uuid, kept.point)
+    signers = Signers(station_key=signer, station_key_signature=kept.sign(station_key_message(signer)))
+    found = [_certifier(station, uuid, signers) for uuid in (board.uuid, bytes(9) + b"\1")]
+    assert found == [kept.point, None]

@@ -7,13 +7,14 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import PolicyError
+from teds_provision.errors import NotWhitelistedError, PolicyError
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning import provision as module
 from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.provisioning.board_type import HardwareCheck
 from teds_provision.provisioning.build import BuildOrder, PreparedOrder
 from teds_provision.provisioning.calibration_guard import guard
+from teds_provision.provisioning.operator import AcceptingOperator, Operator
 from teds_provision.provisioning.progress import StepResult, Steps
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft
@@ -294,3 +295,24 @@ def test_a_calibration_with_errors_needs_a_reason_and_its_errors_are_always_name
     assert len(line.detail["findings"]) == errors
     guard(station, image, None, "a reason", record=False)
     assert len([entry for entry in station.audit_log.entries() if entry.act == "accept-calibration"]) == 1
+
+
+def test_without_a_person_everything_that_needs_a_word_is_refused_with_what_to_do() -> None:
+    nobody, refusal = Operator(), PolicyError("It has another station's key.")
+    who: Any = SimpleNamespace(uuid=UUID, fingerprint="ab" * 32)
+    for ask, error, message, hint in (
+        (lambda: nobody.accept(who), NotWhitelistedError, f"Node {UUID.hex()} is not on the whitelist.",
+         f"teds-provision whitelist add {UUID.hex()} --fingerprint {'ab' * 32}"),
+        (lambda: nobody.take_over("Take it over?", refusal), PolicyError, refusal.message, refusal.hint),
+        (lambda: nobody.jump("Write it?"), PolicyError, "This needs confirmation, but no person can be asked.",
+         "Write it?"),
+        (lambda: AcceptingOperator().jump("Write it?"), PolicyError,
+         "This needs confirmation, but no person can be asked.", "Write it?"),
+    ):  # fmt: skip
+        with pytest.raises(error) as refused:
+            ask()
+        assert (refused.value.message, refused.value.hint) == (message, hint)
+    for ask in (lambda: nobody.low_battery("Write it?"), lambda: AcceptingOperator().low_battery("Write it?")):
+        with pytest.raises(PolicyError):
+            ask()
+    AcceptingOperator().accept(who)

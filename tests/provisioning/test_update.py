@@ -1106,6 +1106,54 @@ def an_update(station: Any = None, **order: Any) -> Any:
     return update._Update(station, none, 1.0, bytes(10), UpdateOrder(image_of(NEWER), **order), SilentReporter())
 
 
+@pytest.mark.parametrize(
+    ("stage", "state", "course"),
+    [
+        ("nothing", NodeState.PROVISIONED, ["keep"]),
+        ("prove", NodeState.PROVISIONED, ["note as kept", "prove in c0"]),
+        ("restart", NodeState.PROVISIONED,
+         ["actuators", "note", "as signed", "address", "restart", "restarted after c0", "prove in c0"]),
+        ("restart", NodeState.KEYED, ["actuators", "note", "address", "restart", "restarted after c0", "prove in c0"]),
+        ("upload", NodeState.FACTORY,
+         ["actuators", "note", "address", "upload", "restart", "restarted after c1", "prove in c1"]),
+    ],
+)  # fmt: skip
+def test_the_course_of_an_update_by_its_first_step(
+    monkeypatch: pytest.MonkeyPatch, stage: str, state: NodeState, course: list[str]
+) -> None:
+    """A lost session is opened again while the image goes over: the restart is seen by c of the last one."""
+    did, node = list[str](), SimpleNamespace(open_counter=b"c0")
+    made = an_update()
+
+    def upload(_node: object, _manager: object) -> None:
+        did.append("upload")
+        node.open_counter = b"c1"
+
+    def note(_node: object, *, as_kept: bool) -> Any:
+        did.append("note as kept" if as_kept else "note")
+        return update._BeforeRestart(b"sheet", _identity(state), None, b"c0")
+
+    @contextmanager
+    def restarted(before: Any) -> Iterator[Any]:
+        did.append(f"restarted after {before.c.decode()}")
+        yield node
+
+    made._met = lambda _seconds: nullcontext(node)
+    made._look = lambda _node: (reported(), stage)
+    made._mismatch = lambda _report: ""
+    made._note, made._upload, made._restarted = note, upload, restarted
+    made._keep = lambda _report: did.append("keep")
+    made._keep_as_signed = lambda _report: did.append("as signed")
+    made._keep_address = lambda _node: did.append("address")
+    made._proven = lambda _node, _manager, before: (did.append(f"prove in {before.c.decode()}"), "updated")[1]
+    monkeypatch.setattr(update, "require_not_measured", lambda *_, released: None)
+    monkeypatch.setattr(update, "require_free_actuators", lambda _node: did.append("actuators"))
+    manager = SimpleNamespace(restart=lambda: did.append("restart"))
+    monkeypatch.setattr(update, "ImageManager", lambda _node: manager)
+    assert made._run(released=False) == ("already" if stage == "nothing" else "updated")
+    assert did == course
+
+
 def test_an_address_that_a_claim_moved_is_made_durable_and_no_other_link_has_one() -> None:
     sent: list[object] = []
     for address in (None, 0x42):
