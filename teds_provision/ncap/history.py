@@ -34,8 +34,7 @@ _WAITING = 4096  # blocks in the queue; a thread that adds more processes them i
 _EVERY = 0.5  # seconds
 _FEW: Final = 8  # blocks of at most so many instants are added one by one, which is faster than numpy's calls
 _SLOW: Final = 25.0  # up to so many instants a second, only a few bins of the last minute are allocated
-# of a bin: a moment so close before an edge counts as after it, since 0.01 is not a binary fraction
-_EDGE: Final = 1e-6
+_EDGE: Final = 1e-6  # seconds: a moment so close before an edge counts as after it, since 0.01 is not a binary fraction
 
 Key = tuple[str, int]
 
@@ -96,7 +95,7 @@ class _Channel:
         minute = self.minute
         if isinstance(minute, FewBins) and minute.full:
             minute = self.minute = minute.all_bins()
-        minute.add_one(math.floor(at / FINE + _EDGE), value, invalid, lost, self.segment)
+        minute.add_one(math.floor((at + _EDGE) / FINE), value, invalid, lost, self.segment)
 
     def ring(self, *, fine: bool) -> Bins:
         """Return the bins of the last minute, or of the hour, for many samples at a time."""
@@ -265,7 +264,7 @@ class History:
             bins: Bins | FewBins = (
                 one.minute if begin >= newest - MINUTE - 1 and end - begin <= MINUTE + 1 else one.hour
             )
-            first, last = (int(np.floor(moment / bins.width + _EDGE)) for moment in (begin, end))
+            first, last = (int(np.floor((moment + _EDGE) / bins.width)) for moment in (begin, end))
             first, last = max(first, bins.newest - bins.size + 1), min(last, bins.newest)
             numbers, low, high, counts = bins.between(first, last)
             segments = bins.segments_of(numbers)
@@ -304,7 +303,7 @@ def _rate(hour: Bins) -> float | None:
 
 def _bins_of(times: NDArray[Any], width: float) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return numbers of the bins of ascending times, each once, and where each begins among them."""
-    numbers = np.floor(np.maximum.accumulate(times) / width + _EDGE).astype(np.int64)
+    numbers = np.floor((np.maximum.accumulate(times) + _EDGE) / width).astype(np.int64)
     starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
     return numbers[starts], starts
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from types import SimpleNamespace
+from typing import Any
 
+import h11
 import pytest
 
 from teds_provision.errors import LinkError
@@ -100,6 +103,29 @@ def test_the_time_of_a_head_is_not_the_time_of_a_body_nor_of_the_work(monkeypatc
         assert await answer(pair, b"cd") == b"HTTP/1.1 200 OK\r\n"
 
     served(work)
+
+
+def test_a_connection_that_is_closing_gets_no_new_limit() -> None:
+    """It still has its last answer to send, however slowly it is read."""
+    limits, ending = list[float](), [False]
+    rig: Any = SimpleNamespace(
+        conn=SimpleNamespace(their_state=h11.IDLE),
+        _awaited=None,
+        _late=None,
+        _forget=lambda: limits.append(-1.0),
+        transport=SimpleNamespace(is_closing=lambda: ending[0]),
+        loop=SimpleNamespace(call_later=lambda seconds, _work: limits.append(seconds)),
+        end=None,
+    )
+    for closing, state, taken in (
+        (True, h11.IDLE, [-1.0]), (False, h11.IDLE, [-1.0, 10.0]), (False, h11.IDLE, []),
+        (False, h11.SEND_BODY, [-1.0, 30.0]), (False, h11.DONE, [-1.0]),
+    ):  # fmt: skip
+        limits.clear()
+        ending[0] = closing
+        rig.conn.their_state = state
+        server.HttpConnection._await(rig)
+        assert limits == taken
 
 
 def test_silent_connections_make_room_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:

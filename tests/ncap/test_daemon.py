@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -13,8 +14,10 @@ from teds_provision.errors import FrozenError, NewerStoreError, NotFoundError, S
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.nodes.link_watch import LinkState
 from teds_provision.ncap.settings import Settings, own_source, parse_http, require_safe
+from teds_provision.ncap.waits import Waits
 from teds_provision.station.store.audit import AuditFilter
 from tests.bench import copied_station
+from tests.pace import PATIENCE
 
 NODE, OTHER = "ab" * 10, "cd" * 10
 
@@ -53,6 +56,53 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     yield made
     made.daemon.buses.close()
     made.station.close()
+
+
+def test_every_setting_reaches_the_part_that_it_is_for(tmp_path: Path) -> None:
+    """A setting that got lost on its way was its default, without a word."""
+    station, waits, trace = copied_station(tmp_path / "home"), Waits(link=7.0), cast("Any", SimpleNamespace())
+    settings = Settings(
+        places=("can:virtual:a", "can:virtual:b?source=0xF1"), trust_dcc=(tmp_path,), file_units="shown", yes=True,
+        record=tmp_path / "record", sinks=("ros2",), scalars=False, brokers={"lab": "mqtt://lab"}, dead_man=250,
+        require_firmware=True, trace=trace,
+    )  # fmt: skip
+    foxglove: Any = SimpleNamespace(url="ws://x")
+    daemon = Daemon(station, settings, foxglove, waits)
+    sinks, measuring = daemon.measuring._sinks, daemon.measuring
+    assert (sinks._specs, sinks._record, sinks._brokers) == (("ros2",), tmp_path / "record", {"lab": "mqtt://lab"})
+    assert (sinks._units, sinks._scalars, sinks._foxglove, sinks.actuators) == ("shown", False, foxglove, True)
+    assert (measuring._dead_man, daemon.leases._dead_man, measuring._require_firmware) == (250, 250, True)
+    assert (measuring._waits, daemon.waits) == (waits, waits)
+    assert (daemon.provisioning._trusted, daemon.adopting._signs) == ((tmp_path,), True)
+    own = f"source=0x{own_source(station.id):02X}"
+    assert [watch.place for watch in daemon.watches] == [f"can:virtual:a?{own}", "can:virtual:b?source=0xF1"]
+    assert [(watch._trace, watch._waits) for watch in daemon.watches] == [(trace, waits)] * 2
+    assert (daemon.status()["actuators"], daemon.status()["dead_man"], daemon.status()["adopt"]) == (True, 250, False)
+    daemon.buses.close()
+    other = Daemon(station, Settings(actuators=False, adopt=True, sinks=("ros2",)))
+    assert (other.measuring._sinks.actuators, other.status()["actuators"], other.status()["adopt"]) == (
+        False, False, True,
+    )  # fmt: skip
+    other.buses.close()
+    station.close()
+
+
+def test_the_parts_of_a_service_ask_each_other(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, asked = bench.daemon, list[Any]()
+    monkeypatch.setattr(daemon.measuring, "on_sighting", lambda uuid: asked.append(("sighting", uuid)))
+    daemon.directory.note(NODE, present=True)
+    for uuid in (NODE, OTHER):
+        daemon.node_locks.acquire(uuid, "it is looked at")
+        daemon.node_locks.release(uuid)
+    assert asked == [("sighting", NODE)], "one that is there may be measured now"
+    assert not daemon.directory.virtual(NODE)
+    daemon.virtuals._all[NODE] = cast("Any", SimpleNamespace(uuid=NODE))
+    assert daemon.directory.virtual(NODE)
+    assert daemon.directory.topic == daemon.names.topic
+    assert daemon.directory.actuator == daemon.leases.state
+    bench.events.clear()
+    daemon.buses.presence.report("One node answers twice.")
+    assert bench.events == [("link", "notice")]
 
 
 def test_a_vault_that_is_open_again_has_all_nodes_selected_and_looked_at_anew(
@@ -442,3 +492,47 @@ def test_a_group_that_does_not_exist_is_neither_changed_nor_deleted_and_who_did_
     daemon.drop_group("arm")
     assert bench.outcomes("group")[-1:] == ["deleted"]
     assert (bench.events, len(bench.selected)) == ([("group", "changed")] * 2, 2)
+
+
+def test_a_service_that_has_failed_already_ends_as_soon_as_it_serves(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course = list[str]()
+
+    async def fan() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            course.append("fan ended")
+
+    async def begin() -> None:
+        await asyncio.sleep(0)
+        course.append("begun")
+
+    async def serve() -> None:
+        stop = asyncio.Event()
+        await asyncio.wait_for(bench.daemon.serve(begin, stop), PATIENCE)
+
+    monkeypatch.setattr(bench.daemon.live, "run", fan)
+    bench.daemon.failure = NewerStoreError("newer")
+    asyncio.run(serve())
+    assert course == ["begun", "fan ended"]
+    bench.daemon.failure = None
+
+    async def end_later() -> None:
+        stop = asyncio.Event()
+        serving = asyncio.create_task(bench.daemon.serve(begin, stop))
+        while len(course) < 3:
+            await asyncio.sleep(0)
+        assert not stop.is_set()
+        bench.daemon._ends()
+        await asyncio.wait_for(serving, PATIENCE)
+
+    asyncio.run(end_later())
+    assert course == ["begun", "fan ended"] * 2
+
+
+def test_a_part_that_changed_the_store_has_it_looked_at_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench.daemon.directory, "refresh", lambda: bench.selected.append("refreshed"))
+    bench.daemon._store_changed()
+    assert (bench.selected, bench.events) == (["refreshed"], [("store", "changed")])

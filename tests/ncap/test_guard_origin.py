@@ -8,6 +8,7 @@ import os
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -462,6 +463,40 @@ def test_at_most_fifty_requests_are_slowed_down_at_once(
     monkeypatch.setattr("teds_provision.ncap.web.guard.asyncio.sleep", sleep)
     assert status_of(guard, {"host": HERE, "authorization": "Bearer nonsense"}) == 429
     assert (slept, guard._slowed) == ([1.0] if waits else [], slowed)
+
+
+def test_who_leaves_while_it_is_slowed_down_leaves_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fifty that hung up would have kept all places for ever, and nobody would be slowed down any more."""
+    guard = Guard(app, Tokens(tmp_path), front((), PORT, tls=False))
+
+    async def sleep(_seconds: float) -> None:
+        raise asyncio.CancelledError
+
+    monkeypatch.setattr("teds_provision.ncap.web.guard.asyncio.sleep", sleep)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(guard._slow_down())
+    assert guard._slowed == 0
+
+
+def test_a_wrong_token_counts_for_a_minute_and_a_hundred_at_most_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guard, now = Guard(app, Tokens(tmp_path), front((), PORT, tls=False)), [100.0]
+
+    async def sleep(_seconds: float) -> None:
+        """Wait no time."""
+
+    monkeypatch.setattr("teds_provision.ncap.web.guard.asyncio.sleep", sleep)
+    monkeypatch.setattr("teds_provision.ncap.web.guard.time", SimpleNamespace(monotonic=lambda: now[0]))
+    statuses = [asyncio.run(guard._wrong_token()).status for _ in range(11)]
+    assert statuses == [401] * 10 + [429]
+    now[0] += 60.0
+    assert asyncio.run(guard._wrong_token()).status == 429, "a minute has not passed"
+    now[0] += 0.5
+    assert asyncio.run(guard._wrong_token()).status == 401
+    for _ in range(200):
+        asyncio.run(guard._wrong_token())
+    assert len(guard._wrong) == 100
 
 
 def test_the_login_address_is_asked_for_and_never_posted_to(tmp_path: Path) -> None:

@@ -318,3 +318,68 @@ def test_a_block_that_cannot_be_shown_ends_the_live_channel_of_no_client(monkeyp
             fan.cancel()
 
     assert json.loads(asyncio.run(first_values()))["channels"] == {"ab/1": [[1.0], [2.0]]}
+
+
+def test_of_blocks_that_nobody_fetches_the_latest_512_are_kept_and_the_others_counted() -> None:
+    live = Live()
+    live.join()
+    for index in range(515):
+        live.block(replace(block(index, 1, 0.01), value=np.array([[float(index)]])))
+    assert live.overrun == 3
+    assert [waiting.index for waiting in live._waiting] == list(range(3, 515))
+    live._gather(0.05)
+    last = live.last("ab" * 10, 1)
+    assert last is not None
+    assert (last.value, last.time) == (514.0, 1e9 + 5.14)
+
+
+def test_the_last_value_is_the_newest_of_each_channel_and_none_if_that_is_not_valid() -> None:
+    live, valid = Live(), np.array([[True, True], [True, False]])
+    live._put_aside([replace(block(0, 2, 0.5, 2), value=np.array([[1.0, 2.0], [3.0, 4.0]]), valid=valid)])
+    found = [live.last("ab" * 10, number) for number in (1, 2, 3)]
+    assert [one and (one.value, one.time) for one in found] == [(3.0, 1e9 + 0.5), (None, 1e9 + 0.5), None]
+
+
+def test_nothing_is_thinned_for_nobody_and_what_came_meanwhile_is_not_sent_late() -> None:
+    live = Live()
+    live.block(block(0, 4, 0.01))
+    assert live._gather(0.05) == {}
+    client = live.join()
+    assert live.listeners == 1
+    live.block(block(4, 2, 0.01))
+    [(times, values)] = live._gather(0.05).values()
+    assert (len(times), len(values), live.values) == (2, 2, 2)
+    live.remove_client(client)
+    live.remove_client(client)
+    assert live.listeners == 0
+
+
+def test_an_angle_that_jumps_at_each_sample_and_has_no_room_is_left_out() -> None:
+    times, angles = np.arange(8.0), np.array([0.1, 6.2] * 4)
+    kept_times, kept = thinned(times, angles, 2, before=0.1)
+    assert (list(kept_times), list(kept)) == ([], [])
+
+
+def test_an_event_is_a_line_of_the_service_and_a_message_of_each_client_by_its_rights() -> None:
+    lines = list[dict[str, Any]]()
+
+    async def run() -> list[list[dict[str, Any]]]:
+        live = Live()
+        live.on_event = lines.append
+        live.event("link", state="early")  # no client yet, and no loop
+        clients, fan = [live.join(), live.join(reader=True)], asyncio.create_task(live.run())
+        await asyncio.sleep(0)
+        live.event("measurement", state="left", why="Cannot write /home/arm/recordings/run.csv.")
+        found = [[json.loads(text) for text in await client.wait()] for client in clients]
+        fan.cancel()
+        return found
+
+    (own,), (reader,) = asyncio.run(run())
+    assert [line["state"] for line in lines] == ["early", "left"]
+    assert own == {"type": "event", **lines[1]}
+    assert lines[1]["event"] == "measurement"
+    assert "/home/arm/" in own["why"]
+    assert "/home/arm" not in reader["why"]
+    assert {name: own[name] for name in own if name != "why"} == {
+        name: reader[name] for name in reader if name != "why"
+    }

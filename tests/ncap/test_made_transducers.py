@@ -69,6 +69,9 @@ def test_a_new_one_is_on_the_whitelist_under_the_key_that_it_made_and_is_there_a
     assert again.all() == [shown | {"simulation": None}]
     assert made.uuid in again
     assert (again.profile_of(made.uuid), again.name_of(made.uuid)) == ("load-cell", "cell")
+    facts = (made.folder / "virtual.json").read_text()
+    (made.folder / "virtual.json").write_text(facts.replace('"load-cell"', "7"))
+    assert again.profile_of(made.uuid) is None, "a name alone is one"
     path = again.calibration_of(made.uuid)
     assert path is not None
     [_, channel, _, unit, points, *rest] = path.read_text().splitlines()

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import InternalError, NodeBusyError, NodeSilentError, NoNodeError, PolicyError
+from teds_provision.errors import FrozenError, InternalError, NodeBusyError, NodeSilentError, NoNodeError, PolicyError
 from teds_provision.ncap.nodes import node_jobs
 from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, NodeLocks
 from teds_provision.provisioning.conversation import SessionLostError
@@ -171,3 +171,19 @@ def test_a_node_that_a_measurement_gave_back_is_frozen_no_more() -> None:
         locks.acquire(NODE, "write", wait=0.0)
     locks.release(NODE)
     assert free == [NODE]
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_node_that_is_measured_is_refused_at_once_and_another_is_waited_for(frozen: bool) -> None:
+    locks = NodeLocks()
+    locks.acquire(NODE, "measurement run", frozen=True)
+    with pytest.raises(FrozenError) as no:
+        locks.acquire(NODE, "write", wait=PATIENCE, frozen=frozen)
+    assert no.value.message == f"Node {NODE} is being measured (measurement run) and cannot be changed now."
+    assert no.value.hint == "End the measurement first."
+    locks.acquire("cd" * 10, "it is looked at")
+    with pytest.raises(NodeBusyError) as busy:
+        locks.acquire("cd" * 10, "write", wait=0.0, frozen=frozen)
+    assert busy.value.message == f"Node {'cd' * 10} is busy: it is looked at."
+    assert busy.value.hint == "Try again when that is done."
+    assert (locks.holder(NODE), locks.holder("cd" * 10)) == ("measurement run", "it is looked at")

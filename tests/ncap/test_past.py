@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import accumulate, pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -559,3 +560,45 @@ def test_what_a_segment_means_is_known_as_long_as_the_minute_or_the_hour_has_sam
     channel.minute = FewBins(history.FINE, 10)
     channel.begin_segment(meanings[0])
     assert channel._meanings == {3: "rad"}
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_sample_at_an_edge_belongs_to_the_bin_that_begins_there(together: bool) -> None:
+    """In 2033 one of 25 had been in the bin before it: what made up for the rounding was less than the rounding."""
+    past, first = History(), 2_000_000_000.0
+    moments = np.array([first + at / 100 for at in range(2000)])
+    one = block(first, [[float(at)] for at in range(2000)])
+    if together:
+        past.block(replace(one, time=moments))
+    else:
+        for at in range(2000):
+            past.block(replace(block(moments[at], [[float(at)]], index=at), time=moments[at : at + 1]))
+    history = past.channel_history(NODE, 1, first + 1.07, first + 19.99, points=3600)
+    assert history["bin"] == 0.01
+    assert set(history["count"]) == {1}
+    assert history["time"] == [round(first + at / 100, 3) for at in range(107, 2000)]
+    for at in range(1950, 2000):
+        last = past.channel_history(NODE, 1, first + at / 100, first + at / 100, points=3600)
+        assert last["low"] == [float(at)]
+
+
+def test_a_channel_is_forgotten_an_hour_after_its_last_value_looked_at_each_minute(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    past, now, turns = History(), [1000.0, NOW], iter([30.0, 40.0, 70.0, 70.0, None])
+    seen = list[int]()
+    past.block(block(NOW - HOUR + 60, [[1.0]]))
+    past.block(replace(block(NOW, [[1.0]]), uuid="cd" * 10))
+
+    def wait(seconds: float) -> bool:
+        assert seconds == 0.5
+        seen.append(len(past))
+        step = next(turns)
+        now[:] = [moment + (step or 0.0) for moment in now]
+        return step is None
+
+    monkeypatch.setattr(past, "_end", SimpleNamespace(wait=wait))
+    monkeypatch.setattr(history, "time", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[1]))
+    past._run()
+    assert seen == [0, 2, 1, 1, 1], "after 70 s: the first one is older than an hour"
+    assert list(past._channels) == [("cd" * 10, 1)]

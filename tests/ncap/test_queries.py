@@ -22,7 +22,7 @@ from teds_provision.errors import (
     UsageError,
 )
 from teds_provision.ncap.nodes.update_actions import UpdateRequest
-from teds_provision.ncap.web import app, clause12, metrics, resources
+from teds_provision.ncap.web import app, clause12, metrics, resources, wot
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError, _require_may_change
 from teds_provision.ncap.web.resources import Resources
@@ -160,7 +160,8 @@ def test_names_of_clause_12_are_separated_by_commas_alone_and_a_module_keeps_its
     }  # fmt: skip
     with pytest.raises(UsageError, match="timId is missing"):
         found.transducers({})
-    for word in ("", "-1", "65536", "x"):
+    assert clause12._integer({"channelid": "65535"}, "channelId") == 65535
+    for word in ("", "-1", "65536", "x", "²", "1.0", " 1"):
         with pytest.raises(UsageError, match="channelId must be a number"):
             clause12._integer({"channelid": word}, "channelId")
 
@@ -410,3 +411,28 @@ def test_an_update_of_other_words_is_refused(query: str, message: str) -> None:
     with pytest.raises(UsageError) as refused:
         asked_for(query)
     assert refused.value.message == message
+
+
+@pytest.mark.parametrize(
+    ("server", "host", "base"),
+    [
+        (("127.0.0.1", 8351), "bench.example:8351", "https://bench.example:8351"),
+        (("127.0.0.1", 8351), "", ""),
+        (("/home/arm/ncap.sock", None), "localhost", ""),
+        (None, "localhost", ""),
+    ],
+)
+def test_things_have_the_address_under_which_they_were_asked_for_and_none_over_the_unix_socket(
+    server: tuple[str, int | None] | None, host: str, base: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over the Unix socket they had http://localhost/ as their base, at which nobody listens."""
+    asked: list[tuple[object, str]] = []
+    monkeypatch.setattr(wot, "_descriptions", lambda daemon, base: asked.append((daemon, base)) or [{"title": "Ä"}])
+    daemon: Any = SimpleNamespace()
+    scope = {"type": "http", "method": "GET", "path": "/", "scheme": "https", "server": server, "query_string": b""}
+    headers = [(b"host", host.encode())] if host else []
+    called: Any = wot.route(daemon).endpoint
+    answer = asyncio.run(called(Request({**scope, "headers": headers, CALLER: Caller("arm", "script")})))
+    assert asked == [(daemon, base)]
+    assert answer.body.decode() == '[{"title": "Ä"}]'
+    assert answer.headers["content-type"].startswith("application/ld+json")

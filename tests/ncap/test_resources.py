@@ -520,3 +520,19 @@ def test_who_asked_is_known_in_whichever_thread_the_work_is_done() -> None:
             return [await work(ACTOR.get) for work in (responses.reading, responses.changing, responses.moving)]
 
     assert asyncio.run(run()) == ["robot 7"] * 3
+
+
+def test_a_resource_of_a_part_is_an_answer_without_files_and_users_for_a_reader() -> None:
+    async def found(request: Request) -> dict[str, Any]:
+        return {"why": "Cannot write /home/arm/plant/pages.", "path": request.url.path}
+
+    part: Any = SimpleNamespace(resources=lambda: {"/plant": found, "/jobs": found})
+    routes = resources.routes_of_parts([part])
+    assert [route.path for route in routes] == ["/plant", "/jobs"]
+    answers = []
+    for caller in (SCRIPT, READER):
+        scope = {"type": "http", "method": "GET", "path": "/plant", "query_string": b"", "headers": [], CALLER: caller}
+        got: Any = asyncio.run(routes[0].endpoint(Request(scope)))
+        answers.append(json.loads(got.body))
+    assert answers[0] == {"why": "Cannot write /home/arm/plant/pages.", "path": "/plant"}
+    assert "/home/arm" not in answers[1]["why"]

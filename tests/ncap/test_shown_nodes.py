@@ -39,6 +39,14 @@ class Shown(NodeDirectory):
         self._judged[NODE] = judged
 
 
+def test_a_node_is_known_by_its_link_or_by_the_store() -> None:
+    directory, kept = Shown(), "cd" * 10
+    assert not directory.known(NODE)
+    directory.note(NODE, present=False)
+    directory._rows[kept] = KnownNode(bytes.fromhex(kept))
+    assert [directory.known(uuid) for uuid in (NODE, kept, "ef" * 10)] == [True, True, False]
+
+
 def test_a_node_that_is_only_on_a_link_is_what_it_says_of_itself() -> None:
     directory = Shown()
     heard = {"verdict": "unsigned", "from": "plain"}

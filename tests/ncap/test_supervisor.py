@@ -256,6 +256,25 @@ def listed(service: Service, *uuids: str) -> RunningMeasurement:
     return running
 
 
+def test_the_entry_of_a_measurement_has_its_counts_and_that_of_a_node_has_none(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = listed(service, NODE, OTHER)
+    running.reports = {NODE: {"samples": 70, "lost": 2}, OTHER: {"samples": 5, "lost": None}}
+    service.measurements._log(running, "joined", NODE)
+    service.measurements._log(running, "ended")
+    assert [(entry.uuid, entry.outcome, entry.detail) for entry in entries(service, "measure")] == [
+        (bytes.fromhex(NODE), "joined", {"id": "1", "owner": "ncap"}),
+        (None, "ended", {"id": "1", "owner": "ncap", "samples": 75, "lost": 2}),
+    ]
+
+    def full(*_words: Any, **_facts: Any) -> None:
+        raise StoreError("The disk is full.")
+
+    monkeypatch.setattr(service.station, "audit", full)
+    service.measurements._log(running, "ended")  # a store that cannot be written ends no measurement
+
+
 def entries(service: Service, act: str) -> list[AuditEntry]:
     return list(service.station.audit_log.chosen(AuditFilter(act=act)))
 
@@ -1059,3 +1078,59 @@ def test_a_measurement_begins_again_if_the_store_lists_other_nodes(
     monkeypatch.setattr(service.measurements, "_is_retired", lambda _uuid: retired)
     job: Any = SimpleNamespace(kept=SimpleNamespace(ends=ends))
     assert service.measurements._has_other_members(running, job) is other
+
+
+ALIVE, DEAD = SimpleNamespace(alive=True), SimpleNamespace(alive=False)
+
+
+@pytest.mark.parametrize(
+    ("phase", "job", "more", "course"),
+    [
+        (Phase.ENDING, ALIVE, {}, []),
+        (Phase.ENDING, ALIVE, {"until": 100.0}, ["_finish"]),
+        (Phase.ENDING, DEAD, {}, ["_finish"]),
+        (Phase.ENDING, None, {"stops": True}, ["_finish"]),
+        (Phase.SELECTING, None, {}, ["_select 100.0"]),
+        (Phase.SELECTING, None, {"stops": True}, ["_end"]),
+        (Phase.LOCKING, None, {}, ["_lock_members 100.0"]),
+        (Phase.LOCKING, None, {"stops": True}, ["_end"]),
+        (Phase.MEASURING, DEAD, {}, ["_end"]),
+        (Phase.MEASURING, None, {}, ["_end"]),
+        (Phase.MEASURING, ALIVE, {"stops": True}, ["_end"]),
+        (Phase.MEASURING, ALIVE, {"not_before": 100.5, "takes_in": True}, []),
+        (Phase.MEASURING, ALIVE, {"takes_in": True}, ["_take_in ALIVE 100.0"]),
+        (Phase.MEASURING, ALIVE, {"looked": 99.6}, []),
+        (Phase.MEASURING, ALIVE, {"looked": 99.5}, ["waiting silent"]),
+        (Phase.MEASURING, ALIVE, {"looked": 99.5, "others": True}, ["waiting silent", "_end"]),
+    ],
+)
+def test_what_is_due_for_a_measurement_in_each_phase(
+    phase: Phase, job: Any, more: dict[str, Any], course: list[str]
+) -> None:
+    """Its end takes at most the time that it was given; one whose members changed begins again with the new ones."""
+    done = list[str]()
+    stop = threading.Event()
+    if more.get("stops"):
+        stop.set()
+    running: Any = SimpleNamespace(
+        phase=phase, job=job, stop=stop, again=False, takes_in=more.get("takes_in", False),
+        until=more.get("until", 100.1), not_before=more.get("not_before", 0.0), looked=more.get("looked", 0.0),
+        present_state=lambda of, taken: ("waiting", "silent" if (of, taken) == (job, 0) else "wrong"),
+    )  # fmt: skip
+
+    def noted(name: str) -> Any:
+        def note(about: Any, *words: Any) -> None:
+            assert about is running
+            done.append(" ".join([name, *("ALIVE" if word is ALIVE else str(word) for word in words)]).strip())
+
+        return note
+
+    names = ("_finish", "_end", "_select", "_lock_members", "_take_in")
+    rig: Any = SimpleNamespace(
+        _lock=threading.Lock(), _has_other_members=lambda _running, _job: more.get("others", False),
+        _publish_state=noted(""), **{name: noted(name) for name in names},
+    )  # fmt: skip
+    MeasurementSupervisor._look_at(rig, running, 100.0)
+    assert done == course
+    assert running.again is more.get("others", False)
+    assert running.looked == (100.0 if "waiting silent" in course else more.get("looked", 0.0))

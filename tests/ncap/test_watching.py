@@ -414,6 +414,107 @@ def test_a_bus_that_is_lost_between_two_looks_is_not_closed_by_its_watch(
     assert (looks, states) == (["lost"] * 3, ["up"] * 3)
 
 
+@pytest.mark.parametrize("connectionless", [True, False])
+def test_on_a_bus_that_works_who_does_not_answer_is_gone_unless_another_part_works_with_it(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, connectionless: bool
+) -> None:
+    """A bus that fails shows nobody as gone at once, and one that asks no single node waits for its silence."""
+    there, away, held = sighting(1), "bb" * 10, "cc" * 10
+    course: list[Any] = []
+    failures: list[LinkError | None] = [None, LinkError("gone"), None]
+    anew = [True, False, False]
+
+    class Check:
+        def __init__(self, port: Any, is_held: Any, waits: Any) -> None:
+            course.append(("asks", port is bus_port, is_held(held), is_held(away), waits is watch._waits))
+
+        def look(self, known: Any) -> Any:
+            assert known == {there.uuid.hex(): there}
+            return [(there.uuid.hex(), there), (away, None), (held, None)]
+
+    def wait(seconds: float) -> None:
+        course.append(("wait", seconds))
+        if len(failures) == 1:
+            watch._stop.set()
+        failures.pop(0)
+        anew.pop(0)
+
+    def discover() -> None:
+        course.append("discover")
+        raise LinkError("gone just now")
+
+    monkeypatch.setattr(link_watch, "PresenceCheck", Check)
+
+    class Looks:
+        def poll(self, seconds: float) -> None:
+            course.append(("poll", seconds))
+
+        def discover(self) -> None:
+            discover()
+
+        @property
+        def failure(self) -> LinkError | None:
+            return failures[0]
+
+    buses: Any = SimpleNamespace(add=lambda _port: SimpleNamespace(discovery=Looks()))
+    monkeypatch.setattr(watch, "_buses", buses)
+    signals = SimpleNamespace(is_set=lambda: anew[0], clear=lambda: course.append("cleared"), wait=wait)
+    monkeypatch.setattr(watch, "_anew", signals)
+    for name in ("_look_for_all", "_report_strangers"):
+        monkeypatch.setattr(watch, name, lambda name=name: course.append(name))
+    monkeypatch.setattr(watch, "_publish_state", lambda state, problem=None: course.append((state, problem)))
+    monkeypatch.setattr(watch, "on_sighting", lambda found: course.append(("here", found.uuid.hex())))
+    monkeypatch.setattr(watch, "_gone", lambda uuid: course.append(("gone", uuid)))
+    monkeypatch.setattr(watch, "_see_who_left", lambda seconds: course.append(("silent", seconds)))
+    bus_port: Any = SimpleNamespace(
+        poll_seconds=30.0,
+        capabilities=SimpleNamespace(connectionless=connectionless),
+        report_rivals=lambda _notice: course.append("rivals"),
+    )
+    watch._known[there.uuid.hex()] = there
+    watch._node_locks.acquire(held, "it is measured")
+    watch._watch_bus(bus_port)
+    begin: list[Any] = [("poll", 30.0), *([("asks", True, True, False, True)] if connectionless else [])]
+    silent: list[Any] = [("silent", 37.5)]
+    looked: list[Any] = [("here", there.uuid.hex()), ("gone", away)] if connectionless else silent
+    end: list[Any] = ["_report_strangers", ("wait", 0.5)]
+    down = course[course.index(("wait", 0.5)) + 1]
+    assert (down[0], down[1].message) == ("down", "gone")
+    assert course == [
+        *begin, "cleared", "_look_for_all", "discover", ("up", None), "rivals", *looked, *end,
+        down, *silent, *end,
+        ("up", None), "rivals", *looked, *end,
+    ]  # fmt: skip
+
+
+def test_a_bug_on_a_link_is_shown_and_logged_and_the_link_is_opened_again(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A thread that had ended would watch the link no more, without a word."""
+    shown, pauses, opened = list[tuple[str, str, str]](), list[float](), list[tuple[str, Any]]()
+
+    def open_place(place: str, trace: Any) -> Any:
+        opened.append((place, trace))
+        raise ZeroDivisionError("bug") if len(opened) < 3 else LinkError("No bus.", hint="Plug it in.")
+
+    def wait(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 7:
+            watch._stop.set()
+
+    monkeypatch.setattr(link_watch, "open_place", open_place)
+    monkeypatch.setattr(watch, "_down", lambda error: shown.append((error.code, error.message, error.hint)))
+    monkeypatch.setattr(watch, "_anew", SimpleNamespace(clear=lambda: None, wait=wait))
+    watch._run()
+    assert (
+        shown
+        == [("failed", "This link failed unexpectedly.", "See the log.")] * 2 + [("link", "No bus.", "Plug it in.")] * 5
+    )
+    assert caplog.messages == ["Watching can:x failed; starting again."] * 2
+    assert opened == [("can:x", None)] * 7
+    assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0], "doubled up to half a minute"
+
+
 def test_a_bus_that_was_opened_anew_is_heard_in_place_of_its_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
     """All threads of the process kept the closed one: no node of that bus was found until the service was restarted."""
     course = list[str]()
@@ -482,6 +583,28 @@ def test_who_comes_is_looked_at_by_detection_and_a_tap_at_once(
     if taken == "workers":
         watch._came(contact)
         assert course == ["workers"], "it is looked at already"
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_node_that_comes_while_the_watch_ends_is_no_bug(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, listed: bool
+) -> None:
+    """At the end of a service that had just met a node its log had a traceback: of workers that were shut down."""
+    monkeypatch.setattr(link_watch, "is_listed", lambda _station, _uuid: listed)
+    for workers in (watch._workers, watch._for_strangers, watch._for_rest):
+        workers.shutdown()
+    found: Any = SimpleNamespace(
+        judged=SimpleNamespace(origin="kept", verified=SimpleNamespace(verdict="authentic")),
+        sheet=None, power=None, firmware=None,
+    )  # fmt: skip
+    node: Any = SimpleNamespace(uuid=sighting(1).uuid, contact=sighting(1).contact())
+    monkeypatch.setattr(link_watch, "look", lambda _station, _node: found)
+    for work in (lambda: watch.on_sighting(sighting(2)), lambda: watch._look(node)):
+        with pytest.raises(RuntimeError, match="after shutdown"):
+            work()
+    watch._stop.set()
+    watch.on_sighting(sighting(3))
+    watch._look(node)
 
 
 @pytest.mark.parametrize(
@@ -586,7 +709,12 @@ def test_an_inspection_that_fails_is_the_nodes_problem_and_ends_no_worker(
     ],
 )
 def test_the_rest_of_a_datasheet_that_cannot_be_read_now_is_no_problem(
-    error: Exception | None, found: bool, noted: list[Any], watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+    error: Exception | None,
+    found: bool,
+    noted: list[Any],
+    watch: LinkWatch,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     shown: list[Any] = []
 
@@ -605,6 +733,8 @@ def test_the_rest_of_a_datasheet_that_cannot_be_read_now_is_no_problem(
     contact: Any = SimpleNamespace(identity=SimpleNamespace(uuid=b"\xab" * 10))
     watch._read_rest(contact)
     assert shown == noted
+    bug = f"Reading the rest of node {'ab' * 10} failed."
+    assert caplog.messages == ([bug] if isinstance(error, ZeroDivisionError) else [])
 
 
 def test_the_number_of_strangers_is_an_event_when_it_changed_and_at_most_every_ten_seconds(

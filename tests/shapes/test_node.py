@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
@@ -96,3 +97,5 @@ def test_what_the_api_says_of_a_channel_has_no_number_that_the_datasheet_lacks()
     bare = channel_facts(replace(oil, low=math.nan, high=math.inf, timing=Timing(), kind=None))
     assert (bare["low"], bare["high"], bare["rate"], bare["kind"]) == (None, None, None, None)
     assert (bare["calibrated"], bare["due"], bare["overdue"]) == (None, None, False)
+    vars(bare_unit := replace(oil))["shown"] = SimpleNamespace(text="far", from_si=lambda value: math.inf)
+    assert channel_facts(bare_unit)["shown"] == {"unit": "far", "factor": None, "offset": None}, "JSON has no infinity"

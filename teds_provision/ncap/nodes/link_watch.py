@@ -366,7 +366,7 @@ class LinkWatch:
                 return
             self._pending.add(uuid)
         listed = is_listed(self._station, contact.identity.uuid)
-        (self._workers if listed else self._for_strangers).submit(self._serve_known, contact)
+        self._have_done(self._workers if listed else self._for_strangers, self._serve_known, contact)
 
     def _serve_known(self, contact: Contact) -> None:
         """Look at a node whose turn has come, if it is still there."""
@@ -435,7 +435,15 @@ class LinkWatch:
             problem=None,
         )
         if found.judged.origin == "kept" and not node.contact.link.capabilities.tapped:
-            self._for_rest.submit(self._read_rest, node.contact)
+            self._have_done(self._for_rest, self._read_rest, node.contact)
+
+    def _have_done(self, workers: ThreadPoolExecutor, work: Callable[[Contact], None], contact: Contact) -> None:
+        """Have it done by one of the workers; a watch that is ending takes no more work."""
+        try:
+            workers.submit(work, contact)
+        except RuntimeError:  # they were shut down, or no thread can be started
+            if not self._stop.is_set():
+                raise
 
     def _read_rest(self, contact: Contact) -> None:
         """Read all of a node that has started since it was read, one node of the link at a time.

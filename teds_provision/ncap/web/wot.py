@@ -28,8 +28,9 @@ def route(daemon: Daemon) -> Route:
     """Return the route; a node without an authentic datasheet, or without a name, is left out."""
 
     async def answer(request: Request) -> Response:
-        host = request.headers.get("host", "")
-        base = f"{request.url.scheme}://{host}" if request.scope.get("server") and host else ""
+        host, server = request.headers.get("host", ""), request.scope.get("server")
+        served = server is not None and server[1] is not None  # over the Unix socket Host is no address of the station
+        base = f"{request.url.scheme}://{host}" if served and host else ""
         found = await reading(_descriptions, daemon, base)
         return Response(json.dumps(found, ensure_ascii=False), media_type=_MEDIA_TYPE)
 

@@ -54,9 +54,13 @@ class MockClient:
         self.place.offers = self.place.after_unpair
 
     async def start_notify(self, uuid: str, callback: Callable[[object, bytearray], None]) -> None:
+        if self.place.notify_errors:
+            raise self.place.notify_errors.pop(0)
         self.notified[uuid] = callback
 
     async def write_gatt_char(self, to: Any, octets: bytes, *, response: bool) -> None:
+        if self.place.write_errors:
+            raise self.place.write_errors.pop(0)
         self.place.writes.append((to.uuid, octets, response))
         await self.place.answer(self, octets)
 
@@ -68,6 +72,8 @@ class MockPlace:
         self.offers = self.after_unpair = {ble.WRITE, ble.NOTIFY, ble.DATA}
         self.room, self.connects, self.unpaired = 20, 0, 0
         self.errors: list[Exception] = []
+        self.notify_errors: list[Exception] = []
+        self.write_errors: list[Exception] = []
         self.writes: list[tuple[str, bytes, bool]] = []
         self.frames: list[tuple[str, str, bytes]] = []
         self.data: list[tuple[int, bytes]] = []
@@ -232,6 +238,36 @@ def test_what_becomes_of_a_connect_that_fails(
             place.run(place.connection.connect)
         assert not place.connection.is_up
     assert place.connects == connects
+
+
+@pytest.mark.parametrize("error", [RuntimeError("refused"), TimeoutError(), OSError("gone")])
+def test_a_subscription_that_fails_is_a_connection_that_did_not_come_about(place: MockPlace, error: Exception) -> None:
+    place.notify_errors = [error]
+    with pytest.raises(NotConnectedError) as lost:
+        place.run(place.connection.connect)
+    assert str(lost.value) == (str(error) or "TimeoutError")
+    assert (place.adapter.held, place.connection.was_up) == (set(), False)
+    place.run(place.connection.connect)
+    assert place.connection.is_up
+
+
+def test_a_write_that_fails_is_a_lost_connection_and_one_that_takes_too_long_is_none(place: MockPlace) -> None:
+    own = place.connection
+    place.run(own.connect)
+    place.write_errors = [RuntimeError("not permitted"), TimeoutError()]
+    with pytest.raises(ConnectionLostError, match=r"^not permitted$") as lost:
+        place.run(lambda: own.exchange(1, b"x", PATIENCE))
+    assert not isinstance(lost.value, NotConnectedError), "it may have gone out"
+    with pytest.raises(TimeoutError):
+        place.run(lambda: own.exchange(1, b"x", PATIENCE))
+    assert (own.is_up, own.asking, place.writes) == (True, False, [])
+    place.clients[0].is_connected = False
+
+    async def work() -> None:
+        await own._doing(lambda _client: asyncio.sleep(0))
+
+    with pytest.raises(ConnectionLostError, match=r"^the connection ended$"):
+        place.run(work)
 
 
 def test_how_long_each_wait_of_a_connection_may_take() -> None:

@@ -90,3 +90,24 @@ def test_an_order_is_sent_once_and_a_frame_that_is_sent_again_keeps_its_transact
     assert scene.link.resend(b"order") == b"two"
     assert scene.link.exchange(b"next") == b"three"
     assert scene.asked == [(7, b"first", 5.0), (8, b"order", 0.25), (8, b"order", 5.0), (9, b"next", 5.0)]
+
+
+def test_a_drive_message_that_finds_no_connection_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, written = Scene(monkeypatch, [], 0.1), list[bytes]()
+    outcomes: list[Exception | None] = [None, LOST]
+
+    def write_data(message: bytes) -> Callable[[], None]:
+        def work() -> None:
+            written.append(message)
+            if (error := outcomes.pop(0)) is not None:
+                raise error
+
+        return work
+
+    monkeypatch.setattr(scene, "write_data", write_data, raising=False)
+    scene.link.drive(b"\1drive")
+    with pytest.raises(NodeSilentError) as silent:
+        scene.link.drive(b"\2drive")
+    assert written == [b"\1drive", b"\2drive"]
+    assert silent.value.message == "The node at C1 does not answer over BLE (gone)."
+    assert silent.value.hint == "Bring it closer. It advertises for 60 s after a tap, and while it has a key."

@@ -243,6 +243,38 @@ def test_an_adapter_that_is_away_is_named_once_and_tried_again(port: MockPort) -
     ]
 
 
+def everyone(port: MockPort, seconds: float = 20.0, listen: float = 0.0) -> list[int | None]:
+    """Return the numbers of all nodes that were found."""
+    return [contact.connection for contact in port.find_all(seconds=seconds, notice=port.note, listen=listen)]
+
+
+def test_all_are_found_once_no_new_one_has_come_for_a_while_and_each_is_disconnected(port: MockPort) -> None:
+    port.heard = {TWO: 0.0, ONE: 1.0, THREE: 12.0}
+    assert everyone(port) == [1, 2], "by their addresses"
+    assert sorted(port.closed) == [ONE, TWO]
+    assert 2.5 <= port.now - 100 < 4.6
+    port.closed.clear()
+    assert port.seeks(ONE) == 1
+    assert everyone(port, listen=15.0) == [1, 2, 3]
+    assert sorted(port.closed) == [TWO, THREE], "one that was connected before stays so"
+    assert {kind for kind, _ in port.notices} == {"waiting"}
+
+
+def test_nobody_who_advertises_is_said_with_the_remedy(port: MockPort) -> None:
+    with pytest.raises(NoNodeError) as none:
+        everyone(port, 5.0)
+    assert none.value.message == "No node advertises within 5 s."
+    assert none.value.hint == "A node advertises for 60 s after a tap, and as long as it has a key."
+    assert 5.0 <= port.now - 100 < 5.3
+
+
+def test_a_question_that_fails_by_a_bug_leaves_no_connection(port: MockPort) -> None:
+    port.heard, port.fails = {ONE: 0.0}, cast("Any", {ONE: ZeroDivisionError()})
+    with pytest.raises(ZeroDivisionError):
+        port.seeks(ONE)
+    assert port.closed == [ONE]
+
+
 # -- connections and data ----------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -274,3 +275,32 @@ def test_the_time_of_the_round_counts_and_a_served_board_has_15_ms_to_be_changed
     port.announced = [announce(TWO)]
     watched.pause(threading.Event())
     assert clock.now == began, "another board has announced itself"
+
+
+def test_a_bus_that_was_lost_in_the_round_is_waited_for_without_it(place: Place) -> None:
+    watched, port, clock = place
+    port.answers = {0x21: identity(ONE), 0x22: identity(TWO)}
+    round_of(watched)
+    watched.lost()
+    pauses = list[float]()
+
+    def wait(seconds: float) -> None:
+        pauses.append(seconds)
+        clock.now += seconds
+
+    stop: Any = SimpleNamespace(is_set=lambda: False, wait=wait)
+    watched.pause(stop)
+    assert pauses == [pytest.approx(0.06)]
+    assert port.waits == []
+
+
+def test_an_announce_ends_the_pause_in_the_middle(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    watched, port, clock = place
+    port.answers = {number + 1: identity(bytes([number, 9] * 5)) for number in range(20)}
+    for _ in watched.round(threading.Event()):
+        pass
+    monkeypatch.setattr(port, "get_all", lambda _seconds: [])
+    port.announced = [announce(TWO)]
+    began = clock.now
+    watched.pause(threading.Event())
+    assert clock.now - began == pytest.approx(0.1), "of six tenths"

@@ -17,6 +17,7 @@ import pytest
 from teds_provision.errors import LinkError, NoReaderError, UsageError
 from teds_provision.links.can import bus as bus_module
 from teds_provision.links.can.bus import Bus, Frame, SentFrames, clock_is_ours
+from teds_provision.links.can.multicast import ReceivedFrame
 from teds_provision.links.can.spec import parse_spec
 
 ADAPTER = "Check that the adapter is up and plugged in."
@@ -293,6 +294,22 @@ def test_the_kernel_of_this_machine_stamps_the_frames_of_its_own_interfaces(text
     assert clock_is_ours(parse_spec(text)) is ours
 
 
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        ("socketcan:can0", {}),
+        ("socketcan:can0?fd=1", {"fd": True}),
+        ("pcan:PCAN_USBBUS1?fd=1&bitrate=250000", {"fd": True, "bitrate": 250_000}),
+        ("udp_multicast:239.74.163.2?port=4000", {"fd": False, "hop_limit": 0, "port": 4000}),
+        ("udp_multicast:239.74.163.2?fd=1&hop_limit=1", {"fd": True, "hop_limit": 1}),
+    ],
+)
+def test_a_bus_is_opened_for_fd_if_it_was_asked_for_and_multicast_is_always_asked(
+    text: str, options: dict[str, Any]
+) -> None:
+    assert bus_module._options(parse_spec(text)) == options
+
+
 def test_a_server_that_hung_up_is_told_from_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     near, far = socket.socketpair()
     bus = SimpleNamespace(_SocketCanDaemonBus__socket=near)
@@ -305,3 +322,59 @@ def test_a_server_that_hung_up_is_told_from_silence(monkeypatch: pytest.MonkeyPa
     near.close()
     assert bus_module._hung_up(cast("Any", bus))
     assert not bus_module._hung_up(cast("Any", SimpleNamespace()))
+
+
+def test_a_datagram_that_python_can_cannot_unpack_is_no_frame_and_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = [can.CanOperationError("could not unpack received message"), can.Message(arbitration_id=9, data=b"a")]
+    bus = opened(monkeypatch, "virtual:faulty", Interface(recv=list(steps)))
+    assert [bus.receive(0.0), bus.receive(0.0)] == [None, Frame(9, b"a")]
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENETUNREACH, "Network is unreachable"), ValueError("bad group")])
+def test_a_fast_path_that_does_not_open_closes_the_bus_that_did(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(*_given: Any, **_more: Any) -> None:
+        raise error
+
+    interface: Any = Interface()
+    monkeypatch.setattr(bus_module, "of_bus", fail)
+    with pytest.raises(NoReaderError):
+        bus_module._multicast(interface, parse_spec("udp_multicast:239.74.163.2"))
+    assert interface.ended == 1
+    assert bus_module._multicast(interface, parse_spec("virtual:a")) is None
+
+
+def test_what_the_fast_path_hears_is_a_frame_nothing_or_the_end_of_the_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = opened(monkeypatch, "virtual:faulty", Interface())
+    frame, found = Frame(0x18DAF121, b"a"), list[Any]()
+    heard: list[Any] = [
+        None,
+        ReceivedFrame(None),
+        ReceivedFrame(frame),
+        ReceivedFrame(None, 0x01),  # an error frame that does not say bus-off
+        ReceivedFrame(None, 0x41),
+        OSError(errno.ENETDOWN, "Network is down"),
+    ]
+
+    def receive(seconds: float) -> Any:
+        assert seconds == 0.25
+        step = heard.pop(0)
+        if isinstance(step, Exception):
+            raise step
+        return step
+
+    multicast: Any = SimpleNamespace(receive=receive)
+    while heard:
+        try:
+            found.append(bus._heard(multicast, 0.25))
+        except LinkError as failure:
+            found.append(failure.message)
+    assert found == [
+        None,
+        None,
+        frame,
+        None,
+        "The CAN controller of virtual:faulty went bus-off: too many frame errors.",
+        "The CAN bus virtual:faulty cannot be read: [Errno 100] Network is down.",
+    ]

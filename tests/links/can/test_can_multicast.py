@@ -216,3 +216,23 @@ def test_the_hop_limit_bounds_how_far_frames_go(
         assert sender.course == [  # type: ignore[attr-defined]
             (family, socket.SOCK_DGRAM), (level, option, hops), (group, 43113), False,
         ]  # fmt: skip
+
+
+def test_a_sender_that_finds_no_way_to_its_group_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[SocketOnPaper] = []
+
+    class Unconnected(SocketOnPaper):
+        def __init__(self, *words: int) -> None:
+            super().__init__(*words)
+            made.append(self)
+
+        def connect(self, place: tuple[str, int]) -> None:
+            raise OSError(101, "Network is unreachable")
+
+        def close(self) -> None:
+            self.course.append("closed")
+
+    monkeypatch.setattr(multicast.socket, "socket", Unconnected)
+    with pytest.raises(OSError, match="unreachable"):
+        multicast._sender(socket.AF_INET, "239.74.163.2", 43113, 0)
+    assert made[0].course[-1] == "closed"

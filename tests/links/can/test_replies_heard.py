@@ -9,8 +9,9 @@ from queue import Empty
 
 import pytest
 
-from teds_provision.errors import LinkError
+from teds_provision.errors import LinkClosedError, LinkError
 from teds_provision.links.can.bus_multiplexer import AddressConflicts, AddressPair, BusMultiplexer
+from teds_provision.links.can.data_streams import CanStreams
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.spec import parse_spec
 
@@ -253,6 +254,28 @@ def test_answers_to_everyone_are_taken_while_they_are_asked_for_and_half_a_secon
     assert station.has_conflict(0x21), "two nodes at one address"
 
 
+def test_a_long_answer_to_everyone_is_asked_on_after_each_sixteen_frames(bus: MockBus, station: BusMultiplexer) -> None:
+    length = 6 + 17 * 7
+    with station.gather(9) as asked:
+        assert bus.hear(f"1{length:03x}09" + "22" * 5) == [GO_ON]
+        for number in range(1, 18):
+            assert bus.hear(f"2{number & 15:x}" + "22" * 7) == ([GO_ON] if number == 16 else []), number
+        assert asked.replies.answers == {0x21: b"\x22" * (length - 1)}
+        assert (asked.replies.busy, asked.replies.conflicts) == (False, set())
+
+
+@pytest.mark.parametrize("data", ["00", "0f07aaaaaaaaaaaa", "0007aaaaaaaaaaaa", "1000", "10030711111111", "40", ""])
+def test_a_frame_that_is_no_beginning_of_a_reply_is_passed_over(
+    bus: MockBus, station: BusMultiplexer, data: str
+) -> None:
+    with station.address_pair(0x21).exchange(7) as line:
+        assert bus.hear(data) == []
+        assert (events(line), line.partial) == ([], None)
+    for _ in range(8):
+        bus.hear(data)
+    assert not station.conflicts.seen_within()
+
+
 def test_a_conflict_is_forgotten_once_one_node_alone_answers_a_later_question(
     bus: MockBus, station: BusMultiplexer
 ) -> None:
@@ -279,7 +302,7 @@ def test_a_reply_after_an_answer_to_everyone_is_a_reply(bus: MockBus, station: B
 
 
 def test_an_announce_ends_the_wait_for_its_node_and_a_press_does_not(bus: MockBus, station: BusMultiplexer) -> None:
-    with station.address_pair(0x21).exchange(7) as line, station.address_pair(0x22).exchange(7) as other:
+    with station.address_pair(0x21).exchange(0) as line, station.address_pair(0x22).exchange(7) as other:
         bus.hear("0100010203040100", identifier=0x1CFF0021)  # pressed
         assert events(line) == []
         assert not station.announced_since(0x21, 0.0)
@@ -291,6 +314,40 @@ def test_an_announce_ends_the_wait_for_its_node_and_a_press_does_not(bus: MockBu
     assert station.presses.marks(0x21, 0x01020304)
     bus.hear("0100010203040000", identifier=0x1CFF0021)
     assert events(line) == [], "nobody waits"
+
+
+def test_a_listener_that_ends_takes_no_other_with_it(bus: MockBus, station: BusMultiplexer) -> None:
+    first, second, third = (station.listen(lambda frame: frame.identifier == 0x1CFF2021) for _ in range(3))
+    second.close()
+    bus.hear("aa", identifier=0x1CFF2021)
+    bus.hear("bb", identifier=0x1CFF2022)
+    assert second.get(0) is None
+    for listener in (first, third):
+        assert [frame.data for frame in listener.get_all(0)] == [b"\xaa"]
+    assert second.get(0) is None, "it was woken once, and heard nothing"
+
+
+def test_of_the_frames_from_our_address_the_latest_count() -> None:
+    """Those of an hour ago had no room left for those of now."""
+    now = [0.0]
+    conflicts = AddressConflicts(0xF1, lambda: now[0])
+    now[0] = 3.0
+    for _ in range(200):
+        conflicts.check_frame(Frame(0x18DA22F1, b"a"))
+        conflicts.record_unsolicited(0x21)
+    assert conflicts.seen_within()
+    now[0] = 3600.0
+    assert not conflicts.seen_within()
+    for _ in range(2):
+        assert not conflicts.frames_within(within=10)
+        conflicts.check_frame(Frame(0x18DA22F1, b"a"))
+    assert conflicts.frames_within(within=10)
+    now[0] = 7200.0
+    for _ in range(4):
+        assert not conflicts.seen_within()
+        conflicts.record_unsolicited(0x21)
+    assert conflicts.seen_within()
+    assert not conflicts.frames_within(within=10), "replies do not count"
 
 
 def test_the_end_of_the_bus_ends_every_wait(bus: MockBus, station: BusMultiplexer) -> None:
@@ -305,3 +362,49 @@ def test_the_end_of_the_bus_ends_every_wait(bus: MockBus, station: BusMultiplexe
         with pytest.raises(LinkError, match="gone"):
             station.send(Frame(TO_NODE, b"\0\0"))
     assert station.failed
+
+
+def test_a_bus_is_closed_once(bus: MockBus, station: BusMultiplexer, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[str] = []
+    monkeypatch.setattr(bus, "close", lambda: closed.append("closed"))
+    listener = station.listen(lambda _frame: True)
+    assert not station.failed
+    station.close()
+    station.close()
+    assert (closed, station.failed, station.busy_seconds) == (["closed"], True, 0.0)
+    with pytest.raises(LinkClosedError, match=r"^The bus virtual:mock was closed\.$"):
+        listener.get(60)
+    with pytest.raises(LinkClosedError):
+        station.send(Frame(TO_NODE, b"\0\0"))
+
+
+# -- data --------------------------------------------------------------------------------------------------------------
+
+
+def data_id(node: int, stream: int = 0, segment: int = 0, own: int = 1) -> int:
+    """Return the identifier of a data frame (operation.md section 5)."""
+    return 0x1CFF0000 | own << 13 | stream << 11 | segment << 8 | node
+
+
+def test_data_are_taken_of_open_streams_that_are_for_this_station(bus: MockBus, station: BusMultiplexer) -> None:
+    streams = CanStreams()
+    opened = [streams.open(node, stream, 4, fd=False) for node, stream in ((0x21, 0), (0x21, 3), (0x22, 0))]
+    assert len({id(assembly) for assembly in opened}) == 3
+    now = time.monotonic()
+
+    def taken() -> list[tuple[int, int, str]]:
+        with streams.listen(station) as heard:
+            for node, stream, own in ((0x21, 0, 1), (0x21, 3, 1), (0x22, 0, 1), (0x21, 1, 1), (0x22, 0, 2)):
+                bus.hear(f"{node:02x}{stream:02x}aabb", identifier=data_id(node, stream, own=own), at=now + 5.0)
+            messages = heard.get_all(60.0)
+            assert heard.lost == 0
+        assert {message.at for message in messages} <= {int((now + 5.0) * 1e9)}
+        return [(message.node, message.stream, message.octets.hex()) for message in messages]
+
+    assert taken() == [(0x21, 0, "2100aabb"), (0x21, 3, "2103aabb"), (0x22, 0, "2200aabb")]
+    streams.close(0x21, 3)
+    streams.close(0x30, 0)
+    assert taken() == [(0x21, 0, "2100aabb"), (0x22, 0, "2200aabb")]
+    streams.open(0x22, 0, 4, fd=False)
+    now -= 10.0  # of a run before it
+    assert taken() == []

@@ -214,3 +214,52 @@ def test_an_order_is_not_sent_again_to_a_busy_node(bus: MockBus) -> None:
     link = CanLink(lambda: bus, lambda: 7, 0x21)  # type: ignore[arg-type, return-value]
     assert link.exchange_within(LONG, 2.0) == BUSY
     assert bus.firsts() == [0]
+
+
+def the_link(bus: MockBus) -> CanLink:
+    return CanLink(lambda: bus, lambda: 7, 0x21)  # type: ignore[arg-type, return-value]
+
+
+@pytest.mark.parametrize(
+    ("answers", "found", "ends"),
+    [
+        ([], b"", 1.0),
+        ([(0.5, "flow", b"\x30\x10\0")], b"\x30\x10\0", 0.5),
+        ([(0.5, "whole", b"\7" + BUSY)], b"\5\7" + BUSY + b"\xcc\xcc", 0.51),
+        ([(0.5, "begun", b"")], b"\x10", 0.51),
+    ],
+)
+def test_the_first_frame_of_a_long_request_is_answered_by_one_frame_or_by_none_in_a_second(
+    bus: MockBus, answers: list[tuple[float, str, bytes]], found: bytes, ends: float
+) -> None:
+    bus.node = lambda _frame: answers
+    assert the_link(bus).begin(100) == found
+    assert bus.now - 100 == pytest.approx(ends, abs=0.02)
+    assert [data for _, data in bus.sent] == [b"\x10\x64\7\0\0\0\0\0"]
+
+
+def test_an_answer_to_a_first_frame_in_fd_is_a_frame_of_fd(bus: MockBus) -> None:
+    bus.spec.fd = True
+    reply = b"\7" + bytes(range(19))
+    bus.node = lambda _frame: [(0.5, "whole", reply)]
+    assert the_link(bus).begin(100) == b"\0\x14" + reply + b"\xcc\xcc"
+    assert [len(data) for _, data in bus.sent] == [64]
+
+
+@pytest.mark.parametrize(
+    ("answer", "uuid"),
+    [
+        (None, None),
+        (b"\1\0\x18" + bytes(range(10)) + b"\2\0\1\0\0\4\0" + bytes(7), None),
+        (b"\1\0\1\x05", None),
+        (b"\0\0\1\x05", None),
+    ],
+)
+def test_an_address_at_which_nobody_identifies_itself_well_has_no_identity(
+    bus: MockBus, answer: bytes | None, uuid: bytes | None
+) -> None:
+    bus.node = lambda _frame: [] if answer is None else [(0.01, "whole", b"\7" + answer)]
+    found = the_link(bus).identify_at(0x21)
+    assert (found and found.uuid) == uuid
+    assert len(bus.sent) == 1, "asked once"
+    assert bus.now - 100 <= 1.0

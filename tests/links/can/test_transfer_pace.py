@@ -99,3 +99,14 @@ def test_a_slow_board_is_not_made_slower_and_saves_up_no_time() -> None:
     for _ in range(50):
         bus.packet(40)
     assert (bus.command_seconds - before) / (bus.now - began) < 0.93
+
+
+def test_the_first_packet_of_a_transfer_waits_for_what_was_sent_since_the_bus_was_opened() -> None:
+    bus = Bus(streams=0.5)
+    for _ in range(100):
+        bus.pace.count(COMMAND)
+        bus.pace.count(DATA)
+    before = bus.now
+    bus.now += 0.01
+    assert bus.pace.wait()
+    assert bus.now - before == pytest.approx(100 * SECONDS / (0.9 - 100 * SECONDS / 0.5), rel=0.11)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,7 +11,7 @@ import pytest
 
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.link import _Exchange
-from teds_provision.links.can.pacing import classic_bits, fd_seconds
+from teds_provision.links.can.pacing import Wire, classic_bits, fd_seconds
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 IDENTIFIERS = (0, 0x1FFFFFFF, 0x18DA21F1, 0x1CFF0021, 0x15555555)
@@ -96,3 +97,30 @@ def test_a_request_that_never_went_out_whole_is_worth_another_try(
     monkeypatch.setattr(link_module, "time", SimpleNamespace(monotonic=lambda: 100.0 + passed))
     rig: Any = SimpleNamespace(_prompt=prompt, _longest=10.0, _tries=tries, _seconds=2.0)
     assert _Exchange._worth_another(cast("Any", rig), 100.0, refused, begun=begun) is worth
+
+
+def test_each_bus_has_a_wire_of_its_own_that_all_its_senders_share_until_the_last_has_gone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("teds_provision.links.can.pacing.tempfile.gettempdir", lambda: str(tmp_path))
+    one, again, other = Wire("239.0.0.1:5"), Wire("239.0.0.1:5"), Wire("239.0.0.2:5")
+    assert len(list(tmp_path.iterdir())) == 2
+    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o600}
+    assert one.occupy(100.0, 0.5) == 100.5
+    assert again.occupy(100.25, 0.5) == 101.0, "as soon as it is free"
+    assert other.occupy(100.25, 0.5) == 100.75
+    assert one.occupy(200.0, 0.25) == 200.25
+    assert (one.busy_seconds, again.busy_seconds, other.busy_seconds) == (1.25, 1.25, 0.5)
+    one.close()
+    other.close()
+    other.close()
+    assert len(list(tmp_path.iterdir())) == 1
+    assert again.occupy(200.0, 1.0) == 201.25
+    again.close()
+    assert list(tmp_path.iterdir()) == []
+    new = Wire("239.0.0.1:5")
+    assert (new.busy_seconds, new.occupy(1.0, 0.5)) == (0.0, 1.5), "nothing is left of those before"
+    assert new.occupy(100.0, 0.5) == 100.5
+    assert new.occupy(90.25, 0.5) == 90.75, "of before a restart of the clock: so long is no queue"
+    assert new.occupy(81.0, 0.5) == 91.25
+    new.close()

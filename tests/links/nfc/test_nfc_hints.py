@@ -58,6 +58,40 @@ def test_states(records: list[tuple[str, str]], state: str, percent: int | None,
     assert (found.state, found.battery_percent, found.battery_celsius) == (state, percent, celsius)
 
 
+@pytest.mark.parametrize(
+    ("found", "text"),
+    [
+        (Charging("wanted", 80, 24), "battery 80 %, 24 °C, charging wanted"),
+        (Charging("full", 0, 0, 31), "battery 0 %, 0 °C, full"),
+        (Charging("no", None, -5), "-5 °C, no charging"),
+        (Charging("charging", 100), "battery 100 %, charging"),
+        (Charging("error", node_celsius=31), "charging error"),
+    ],
+)
+def test_the_line_for_people_has_what_is_known_of_the_battery(found: Charging, text: str) -> None:
+    assert found.text == text
+    assert found.to_json() == {
+        "state": found.state,
+        "battery_percent": found.battery_percent,
+        "battery_celsius": found.battery_celsius,
+        "text": text,
+        "raw": {},
+    }
+
+
+@pytest.mark.parametrize(
+    ("tnf", "octets", "name"),
+    [
+        (1, b"U", "urn:nfc:wkt:U"),
+        (2, b"text/plain", "text/plain"),
+        (4, b"a b~", "urn:nfc:ext:a b~"),
+        (1, b"\x00\x1f\x7f\x80\xff", "urn:nfc:wkt:\\x00\\x1f\\x7f\\x80\\xff"),
+    ],
+)
+def test_of_the_name_of_a_record_all_but_printable_ascii_is_escaped(tnf: int, octets: bytes, name: str) -> None:
+    assert NdefRecord(tnf, octets).name == name
+
+
 def test_a_bluetooth_address_is_little_endian_in_its_record() -> None:
     octets = bytes.fromhex("081B01010057D8C101021C00")
     record = NdefRecord(2, b"application/vnd.Bluetooth.le.oob", octets)

@@ -196,3 +196,7 @@ def test_without_the_client_library_its_package_is_named(monkeypatch: pytest.Mon
     with pytest.raises(NoReaderError) as caught:
         open_reader("pcsc")
     assert caught.value.hint == "sudo apt install pcscd"
+    assert caught.value.message == "PC/SC readers need libpcsclite.so.none, which is not installed."
+    monkeypatch.setattr(pcsclite, "LIBRARY", None)  # the program itself: a library without these functions
+    with pytest.raises(NoReaderError):
+        open_reader("pcsc")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import time
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -231,3 +232,38 @@ def test_a_node_keeps_its_place_on_the_reader_while_it_is_bound() -> None:
     assert muted == []
     made.close()
     assert (made.socket, made.bound, muted) == (None, False, ["closed"])
+
+
+def activated(uid: bytes, *steps: bytes | Exception) -> tuple[Any, list[str]]:
+    """Return what a node with this UID is activated by, or None, and its answers to the frames of a reader."""
+    answers, waiting = list[str](), list(steps)
+    device: Any = object.__new__(NodeDevice)
+
+    def receive(_wait: float, _brty: str) -> tuple[str, bytearray, str]:
+        step = waiting.pop(0) if waiting else nfc.clf.TimeoutError()
+        if isinstance(step, Exception):
+            raise step
+        return "106A", bytearray(step), "reader"
+
+    device._recv_data = receive
+    device._send_data = lambda _brty, data, _addr: answers.append(bytes(data).hex())
+    target = nfc.clf.LocalTarget("106A", sens_res=b"\x44\x03", sdd_res=uid, sel_res=b"\x20")
+    return device._listen_tta(target, time.time() + 60), answers
+
+
+def test_a_node_is_selected_level_by_level_and_from_the_start_after_a_torn_frame() -> None:
+    """A reader that asked for the second level after its field was off would select a node that is not there."""
+    uid, torn = bytes(range(1, 8)), nfc.clf.TransmissionError("torn")
+    first, second = bytes.fromhex("8801020388"), bytes.fromhex("0405060700")
+    for asked in (b"\x26", b"\x52"):
+        found, answers = activated(
+            uid, asked, b"\x93\x20", b"\x93\x70" + first, b"\x95\x20", b"\x95\x70" + second, b"\xe0\x80"
+        )
+        assert answers == ["4403", first.hex(), "04", second.hex(), "20"]
+        assert bytes(found.tt4_cmd) == b"\xe0\x80"
+    found, answers = activated(uid, b"\x26", b"\x93\x70" + first, torn, b"\x95\x20", b"\x93\x20")
+    assert (found, answers) == (None, ["4403", "04", first.hex()])
+    found, answers = activated(uid, b"\x26", b"\x93\x70" + first, b"\x52", b"\x95\x20", b"\x93\x20")
+    assert (found, answers) == (None, ["4403", "04", "4403", first.hex()])
+    found, answers = activated(uid, b"\x26", b"\x93\x70" + first[::-1], b"\x95\x20")
+    assert (found, answers) == (None, ["4403"]), "another node is selected"
