@@ -138,6 +138,22 @@ def asked_for(desk: Desk, good: SignRequest, board: Board, **changes: Any) -> Si
     return proven(replace(good, job=made.id), desk.line, board)
 
 
+def test_an_answer_that_another_process_gave_meanwhile_is_the_answer(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = desk.request(desk.run(), make_board(1))
+    seen, line = list[str](), desk.office.plant.line
+
+    def sign_request(hash: str, way: str) -> Any:
+        seen.append(hash)
+        return None if len(seen) == 1 else SimpleNamespace(answer=b"given meanwhile" if len(seen) == 2 else None)
+
+    monkeypatch.setattr(line, "sign_request", sign_request)
+    assert office.answer(desk.office, request.octets) == b"given meanwhile"
+    assert seen == [request.hash] * 2
+    assert line.units(request.job) == [], "no second unit or sequence"
+
+
 def test_a_name_that_the_job_does_not_give_is_signed_for_nobody(desk: Desk) -> None:
     board = make_board(1)
     request = asked_for(desk, desk.request(desk.run(), board), board, name="cell {unit}")

@@ -15,6 +15,7 @@ import pytest
 from teds_provision import plant
 from teds_provision.cli.rendering import local_time
 from teds_provision.errors import BadDataError, PolicyError
+from teds_provision.handover.incoming import NothingImportedError
 from teds_provision.plant import schema
 from teds_provision.plant.commands import nodes as of_nodes
 from teds_provision.plant.commands import parcels as of_parcels
@@ -463,6 +464,41 @@ def test_a_node_of_this_station_has_all_its_conflicts_and_the_name_that_the_plan
     assert asked == [[two], [three]]
     monkeypatch.setattr(type(station.plant), "roster", None)
     assert list(of_nodes.VIEW.described(station, iter(rows))) == rows
+
+
+@pytest.mark.parametrize(("fate", "refused"), [("the same", True), ("changed", False), ("taken meanwhile", False)])
+def test_a_bundle_of_which_nothing_comes_in_is_answered_unless_that_has_changed(
+    home: Path, monkeypatch: pytest.MonkeyPatch, fate: str, refused: bool
+) -> None:
+    with Station.inspect(home) as station:
+        row = ParcelRow("p1", "in", WEST, "bundle", "waiting", "2099-01-01T00:00:00Z", "", "a move")
+        station.plant.parcels.put(row, b"bundle")
+    nodes = (SimpleNamespace(node=SimpleNamespace(uuid=bytes(10)), why="it is revoked"),)
+    tries, answered = list[bytes](), list[tuple[str, str]]()
+
+    def plan_import(here: Station, octets: bytes) -> Any:
+        tries.append(octets)
+        if len(tries) == 1 and fate == "taken meanwhile":
+            here.plant.parcels.drop("p1", "in")
+        if len(tries) == 1 or fate != "changed":
+            raise NothingImportedError(cast("Any", None), cast("Any", nodes))
+        return None
+
+    monkeypatch.setattr(of_parcels, "plan_import", plan_import)
+    monkeypatch.setattr(
+        plant.parcels, "refuse_bundle", lambda _station, error, parcel: answered.append((error.message, parcel))
+    )
+    why = f"None of the nodes in the bundle can be imported; {'00' * 10}: it is revoked."
+    told = call(home, "import-keys", "--received", "--yes")
+    assert (told.code, told.out) == (6, "0 parcels imported. 1 parcel refused.\n")
+    assert told.err.splitlines()[0] == f"Warning: Parcel p1 is refused: {why}"
+    assert "The next sync reports this to the sender, which does not send these keys again." in told.err
+    assert answered == ([(why, "p1")] if refused else [])
+    assert len(tries) == (1 if fate == "taken meanwhile" else 2)
+    if fate == "the same":
+        tries.clear()
+        planned = call(home, "import-keys", "--received", "--dry-run")
+        assert (planned.code, tries, answered) == (6, [b"bundle"], [(why, "p1")]), "a plan answers nothing"
 
 
 def test_each_parcel_that_waits_is_shown_with_its_reason_and_taken_in(

@@ -690,6 +690,53 @@ def test_an_earlier_request_is_repeated_and_its_answer_used_if_it_is_newer(
     assert [entry.detail for entry in signed] == ([{"sequence": 12, "office": "office"}] if asked else [])
 
 
+@pytest.mark.parametrize(
+    ("rows", "found"),
+    [
+        ([], None),
+        ([{}], 0),
+        ([{"sequence": 8}], None),  # the node has written since, and nothing was signed
+        ([{"sequence": 8, "answer": b"signed"}], 0),
+        ([{"peer": "another"}], None),
+        ([{"peer": "another"}, {}], 1),
+        ([{"ahead": timedelta(0)}], 0),
+        ([{"ahead": timedelta(seconds=1)}], None),  # no office takes it before its time
+        ([{"ahead": timedelta(seconds=1), "answer": b"signed"}], 0),
+        ([{"epoch": 4}], None),
+        ([{"name": None}], None),
+        ([{"calibration": b"d"}], None),
+        ([{"blocks": {(0, 1): b"y"}}], None),
+        ([{"blocks": {(0, 1): b"x", (0, 128): b"signed"}}], 0),  # signed or not, it is the same
+        ([{"sequence": 8, "answer": b"signed"}, {}], 1),
+        ([{}, {"sequence": 8, "answer": b"signed"}], 0),
+        ([{}, {"answer": b"signed"}], 1),
+        ([{"answer": b"signed"}, {}], 0),
+        ([{"sequence": 10, "answer": b"signed"}, {"sequence": 9, "answer": b"signed"}], 0),
+    ],
+)
+def test_an_earlier_request_is_one_for_exactly_this_the_newest_by_its_sequence(
+    station: Station, monkeypatch: pytest.MonkeyPatch, rows: list[dict[str, Any]], found: int | None
+) -> None:
+    latest = NOW + timedelta(hours=24)
+    usual = {"sequence": 9, "answer": None, "peer": "office", "ahead": -timedelta(days=1), "epoch": 3, "name": "cell",
+             "calibration": b"c", "blocks": {(0, 1): b"x"}}  # fmt: skip
+    made = [stub(**usual | row | {"request": number}) for number, row in enumerate(rows)]
+    asked = list[tuple[object, ...]]()
+    requests = [
+        stub(epoch=row.epoch, name=row.name, calibration=row.calibration, sequence=row.sequence,
+             created=latest + row.ahead, image=Image(NODE, row.blocks)) for row in made
+    ]  # fmt: skip
+    monkeypatch.setattr(sign_requests, "roster_of", lambda _: None)
+    monkeypatch.setattr(sign_requests, "now_of", lambda _: NOW)
+    monkeypatch.setattr(sign_requests, "open_request", lambda number, _: requests[number])
+    monkeypatch.setattr(station.plant.line, "sign_requests", lambda *given: asked.append(given) or made)
+    wanted: Any = stub(job="job", office="office", image=Image(NODE, {(0, 1): b"x", (0, 128): b"of the node"}),
+                       epoch=3, name="cell", calibration=b"c", sequence=9)  # fmt: skip
+    earlier = sign_requests._earlier(station, wanted)
+    assert earlier is (None if found is None else made[found])
+    assert asked == [("job", NODE, "out")]
+
+
 def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:
     for registry in (None, REGISTRY):
         transport = stub(
@@ -999,6 +1046,16 @@ def test_a_parcel_that_waited_for_pages_is_judged_once_more(station: Station, mo
     assert (judged("")[0], imported) == (True, ["p"])
     taken = incoming.ImportResult.__new__(incoming.ImportResult)
     assert (judged(taken)[0], imported) == (True, ["p", "p"])
+
+
+def test_a_parcel_that_waits_here_already_stays_in_the_registry_too(station: Station) -> None:
+    reader: Any = parcels._Reader.__new__(parcels._Reader)
+    reader.station = station
+    with station.transaction():
+        station.plant.parcels.put(ParcelRow("p1", "in", WEST, "bundle", "waiting", "2099-01-01T00:00:00Z"), b"kept")
+    assert reader.process_parcel(Parcel("p1", station.fingerprint, b"{another", "")) is False
+    assert station.plant.parcels.document("p1", "in") == b"kept"
+    assert station.plant.alarms.all() == []
 
 
 def test_a_failure_that_is_not_the_parcels_fault_throws_nothing_away(station: Station) -> None:

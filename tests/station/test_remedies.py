@@ -252,6 +252,12 @@ def test_beside_the_code_of_a_label_stand_its_name_and_all_digits_16_in_a_line()
     assert label.Label(NODE, digits, "elbow").lines == ["elbow", *lines]
 
 
+@pytest.mark.parametrize("text", ["", "x" * 91, "TEDS1:" + "8" * 20 + ":" + "a" * 63 + "g", "TEDS1:" + "8" * 20])
+def test_what_is_no_label_is_read_as_none(text: str) -> None:
+    assert label.read_label(text) is None
+    assert label.read_label("TEDS1:" + "8d" * 10 + ":" + "AB" * 32) == (bytes.fromhex("8d" * 10), "ab" * 32)
+
+
 def test_a_certificate_comes_from_the_station_with_the_ca_key() -> None:
     for key in (None, stub(point=b"another CA")):
         own = bare(identity.StationIdentity, _vault=lambda key=key: stub(ca=lambda: key))
