@@ -295,3 +295,60 @@ def outside_every_core(tree: ast.AST) -> list[int]:
 def test_what_a_station_starts_gets_all_cores() -> None:
     found = {str(path.relative_to(PACKAGE)): outside_every_core(parsed(path)) for path in PACKAGE.rglob("*.py")}
     assert {name for name, lines in found.items() if lines} == ALONE
+
+
+def test_a_core_is_free_up_to_35_percent_and_taken_beyond_half() -> None:
+    run = Run()
+    assert run.look(others={0: 0.7, 1: 0.7, 2: 0.7}) == 0, "35 % of two seconds"
+    assert run.look(others={0: 1.0}) == 0, "half of a core is no reason to move"
+    assert run.look(others={0: 1.01}) == 1
+    assert Run().look(others={0: 0.71, 1: 0.71, 2: 0.71}) is None
+
+
+def test_its_own_work_makes_no_core_better_than_an_idle_one() -> None:
+    run = Run()
+    run.kernel.work |= {0: 0.3, 1: 0.1}
+    run.kernel.mine += 0.9
+    assert run.look() == 0, "on each of them others do nothing"
+
+
+def test_figures_that_lack_one_core_change_nothing_either() -> None:
+    with pytest.raises(ValueError, match="other cores"):
+        OneCore(StatedKernel(cores=frozenset({2, 6})))
+
+
+@pytest.mark.parametrize(
+    ("policy", "waits"),
+    [(os.SCHED_OTHER, True), (os.SCHED_BATCH, True), (os.SCHED_FIFO, False), (os.SCHED_RR, False)],
+)
+def test_threads_of_real_time_processes_do_not_wait(monkeypatch: pytest.MonkeyPatch, policy: int, waits: bool) -> None:
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _process: policy)
+    assert LinuxKernel().waits() is waits
+
+
+def test_who_starts_processes_keeps_every_core_until_the_outer_block_ends() -> None:
+    run = Run()
+    assert run.look() == 0
+    with run.kept.on_every_core():
+        with run.kept.on_every_core():
+            assert run.kernel.places[1] == {0, 1, 2}
+        assert run.kernel.places[1] == {0, 1, 2}
+    assert run.kernel.places[1] == {0}
+    with run.kept.on_every_core():
+        run.kept.leave()
+        run.kernel.places[1] = frozenset({2})  # as somebody else gave it
+    assert run.kernel.places[1] == {2}
+
+
+def test_a_thread_that_has_ended_leaves_the_others_to_be_placed() -> None:
+    run = Run(StatedKernel(started=[1, 5, 7]))
+    place = run.kernel.place
+
+    def gone(thread: int, cores: Set[int]) -> None:
+        if thread == 5:
+            raise ProcessLookupError
+        place(thread, cores)
+
+    run.kernel.place = gone  # type: ignore[method-assign]
+    assert run.look() == 0
+    assert run.kernel.places == {1: {0}, 7: {0}}

@@ -8,6 +8,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -15,7 +16,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision import files, lazy, limits, one_core, optional_rooms, portable
-from teds_provision.errors import StoreError, UsageError
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, UsageError, VaultError
 from teds_provision.files import json_files, make_folder, new_file, write_new
 from teds_provision.one_core import OneCore, _capacity, _keep
 
@@ -260,3 +261,216 @@ def test_work_is_shared_only_among_processes_that_can_inherit_it(monkeypatch: py
         assert portable.cores_to_share() == 1
     monkeypatch.delattr(os, "sched_getaffinity")
     assert portable.cores_to_share() == 1
+
+
+# -- limits ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the limits so small that a test reaches them."""
+    few = replace(
+        limits.LIMITS, text_file=20, toml_keys=2, json_depth=3, toml_depth=3, xml_elements=2, xml_attributes=3
+    )
+    monkeypatch.setattr(limits, "LIMITS", few)
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize(
+    ("read", "why"),
+    [
+        (lambda: limits.check_toml("x" * 20, "a.toml"), None),
+        (lambda: limits.check_toml("ä" * 10, "a.toml"), None),
+        (lambda: limits.check_toml("ä" * 10 + "x", "a.toml"), "A.toml has 21 octets; at most 20 are read."),
+        (lambda: limits.check_toml("a=1\nb=2", "a.toml"), None),
+        (lambda: limits.check_toml("a=1\nb=2\nc=3", "a.toml"), "a.toml: there are 3 keys; at most 2 are read."),
+        (lambda: limits.load_toml("a=[[[[1]]]]", "a.toml"), "A.toml nests deeper than 3 levels."),
+        (lambda: limits.load_toml("a=[[1]]", "a.toml"), None),
+        (lambda: limits.load_json("[[[1]]]", "the list"), None),
+        (lambda: limits.load_json("[[[[[1]]]]]", "the list"), "The list nests deeper than 3 levels."),
+        (lambda: limits.load_json('{"a": [{"b": [[1]]}]}', "the list"), "The list nests deeper than 3 levels."),
+        (lambda: limits.load_json("[[], [], [], []]", "the list"), None),
+        (lambda: limits.check_xml(b"<a b='' c='' d=''>", "the set"), None),
+        (lambda: limits.check_xml(b"<a b='' c='' d='' e=''>", "the set"),
+         "There are 4 attributes in the set here; at most 3 are read."),
+        (lambda: limits.check_xml(b"<a><b>", "the set"), None),
+        (lambda: limits.check_xml(b"<a><b></b>", "the set"), "There are 3 tags in the set here; at most 2 are read."),
+    ],
+)  # fmt: skip
+def test_a_document_is_as_large_as_its_limit_and_no_larger(read: Callable[[], Any], why: str | None) -> None:
+    if why is None:
+        read()
+        return
+    with pytest.raises(BadDataError) as refused:
+        read()
+    assert refused.value.message == why
+
+
+@pytest.mark.parametrize("lost", [ValueError("4300 digits"), RecursionError("too deep")])
+def test_toml_that_python_cannot_read_is_no_valid_toml(monkeypatch: pytest.MonkeyPatch, lost: Exception) -> None:
+    monkeypatch.setattr(limits.tomllib, "loads", raises(lost))
+    with pytest.raises(BadDataError) as refused:
+        limits.load_toml("a = 1", "a.toml")
+    assert refused.value.message == f"a.toml is not valid TOML: {lost}."
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("x", "'x'"), ("x" * 40, f"'{'x' * 40}'"), ("x" * 41, f"'{'x' * 12}… (41 characters)'"), ("1.5", "'1.5'"),
+        ("", "''"), ("٣", "'٣'"), ("+-1", "'+-1'"),
+    ],
+)  # fmt: skip
+def test_what_is_no_whole_number_is_shown_in_forty_characters(text: str, shown: str) -> None:
+    with pytest.raises(BadDataError) as refused:
+        limits.whole_number(text, "the epoch")
+    assert refused.value.message == f"The epoch is no whole number: {shown}."
+    assert [limits.whole_number(good, "the epoch") for good in ("7", " -7\n", "+007")] == [7, -7, 7]
+
+
+# -- files that are odd ------------------------------------------------------------------------------------------------
+
+
+def test_a_device_is_a_name_that_is_taken_for_a_new_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileExistsError), files.whole_file(tmp_path / "pipe", replace=False):
+        pass
+    why = "it is a device, pipe or socket"
+    with pytest.raises(OSError, match=why) as error, files.whole_file(tmp_path / "pipe", replace=True):
+        pass
+    assert error.value.errno == errno.EINVAL
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+@pytest.mark.parametrize("replaces", [True, False])
+def test_a_file_is_on_the_disk_before_its_name_and_the_name_before_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replaces: bool
+) -> None:
+    synced: list[Any] = []
+    path = tmp_path / "a"
+
+    def sync(descriptor: int) -> None:
+        place = os.readlink(f"/proc/self/fd/{descriptor}")
+        synced.append(("folder" if place == str(tmp_path) else "file", path.exists()))
+
+    monkeypatch.setattr(files.os, "fsync", sync)
+    with files.whole_file(path, replace=replaces) as file:
+        file.write(b"whole")
+    assert synced == [("file", False), ("folder", True)]
+
+
+def test_a_link_to_nothing_is_a_name_that_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "none")
+    for refused in (link, tmp_path):
+        with pytest.raises(UsageError, match="already exists and is not overwritten"):
+            files.require_new(refused)
+    with pytest.raises(NotFoundError) as error:
+        files.require_new(tmp_path / "none" / "a")
+    assert (error.value.message, error.value.hint) == (
+        f"There is no folder {tmp_path / 'none'}.",
+        "Create it, or choose another path.",
+    )
+    monkeypatch.setattr(os, "link", raises(OSError(errno.EPERM, "Operation not permitted")))
+    draft = tmp_path / "draft"
+    draft.write_bytes(b"new")
+    with pytest.raises(FileExistsError):
+        files._publish(draft, link, replace=False)
+    assert (link.is_symlink(), draft.exists()) == (True, True)
+    monkeypatch.setattr(os, "link", raises(OSError(errno.EIO, "Input/output error")))
+    with pytest.raises(OSError, match="Input/output"):
+        files._publish(draft, tmp_path / "new", replace=False)
+
+
+@pytest.mark.parametrize(
+    ("what", "article"), [("key", "a key"), ("image", "an image"), ("EDS file", "an EDS file"), ("URL", "an URL")]
+)
+def test_what_a_file_is_too_large_for_is_named(tmp_path: Path, what: str, article: str) -> None:
+    (tmp_path / "a").write_bytes(b"12")
+    with pytest.raises(BadDataError) as refused:
+        files.read_limited(tmp_path / "a", 1, what)
+    assert refused.value.message == f"{tmp_path / 'a'} is larger than 1 octets, which is too large for {article}."
+
+
+def test_the_pipe_of_a_shell_is_read_by_its_descriptor_and_waited_for(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    try:
+        for place in (f"/dev/fd/{read}", f"/proc/self/fd/{read}"):
+            files.require_no_pipe(Path(place))
+            descriptor, size = files._opened(place)
+            assert (os.get_blocking(descriptor), size) == (True, 0)
+            os.close(descriptor)
+    finally:
+        os.close(read)
+        os.close(write)
+    files.require_no_pipe(Path("a\0b"))
+    files.require_no_pipe(tmp_path / "none")
+    (tmp_path / "a").write_bytes(b"123")
+    descriptor, size = files._opened(tmp_path / "a")
+    os.close(descriptor)
+    assert size == 3
+
+
+@pytest.mark.parametrize("mode", [0o710, 0o701, 0o750, 0o704])
+def test_a_private_folder_is_closed_to_the_group_too(tmp_path: Path, mode: int) -> None:
+    folder = tmp_path / "a"
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(PermissionError):
+        files.private_folder(folder)
+
+
+@pytest.mark.parametrize(("letter", "long"), [("a", False), ("ä", True)])
+def test_a_socket_is_named_by_its_octets(tmp_path: Path, letter: str, long: bool) -> None:
+    folder = tmp_path / "f"
+    folder.mkdir()
+    name = letter * (95 - len(str(folder)) if len(str(folder)) < 60 else 5)
+    path = folder / name
+    with files.short_path(path) as short:
+        assert (short == str(path)) is (len(os.fsencode(path)) <= 100)
+    if len(str(folder)) < 60:
+        assert (len(os.fsencode(path)) > 100) is long
+
+
+def test_a_socket_that_cannot_be_bound_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[str] = []
+    real = files.socket.socket
+
+    class Listener:
+        def __init__(self, *words: Any) -> None:
+            course.append("made")
+
+        def bind(self, _name: str) -> None:
+            raise OSError(errno.EADDRINUSE, "Address already in use")
+
+        def close(self) -> None:
+            course.append("closed")
+
+    monkeypatch.setattr(files.socket, "socket", Listener)
+    before = os.umask(0o022)
+    try:
+        with pytest.raises(StoreError, match="cannot be written: Address already in use"):
+            files.listen_alone(tmp_path / "s", 1)
+        assert os.umask(0o022) == 0o022, "the mask is as it was"
+    finally:
+        os.umask(before)
+    assert course == ["made", "closed"]
+    monkeypatch.setattr(files.socket, "socket", real)
+    listener = files.listen_alone(tmp_path / "s", 1)
+    assert (tmp_path / "s").stat().st_mode & 0o777 == 0o600
+    listener.close()
+
+
+@pytest.mark.parametrize(
+    ("error", "failure", "kind", "message"),
+    [
+        (FileNotFoundError(2, "x"), StoreError, NotFoundError, "There is no folder /a."),
+        (NotADirectoryError(20, "x"), StoreError, NotFoundError, "There is no folder /a."),
+        (FileNotFoundError(2, "x"), VaultError, VaultError, "/a/b cannot be written: x."),
+        (IsADirectoryError(21, "x"), StoreError, UsageError, "/a/b is a folder, not a file."),
+        (OSError(28, "x"), StoreError, StoreError, "/a/b cannot be written: x."),
+    ],
+)
+def test_why_a_file_cannot_be_written(error: OSError, failure: Any, kind: type[Exception], message: str) -> None:
+    found = files._cannot_write(Path("/a/b"), error, failure)
+    assert (type(found), found.message) == (kind, message)

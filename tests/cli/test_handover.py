@@ -6,8 +6,10 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.cli.station import handover
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.handover.incoming import NodeProof, NodeProofFailure
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, payload_of, seal_bundle
@@ -595,12 +598,13 @@ def test_the_plan_of_an_export_names_nodes_holders_and_keys_to_compare(
             nodes=[SimpleNamespace(uuid=uuid, epoch=3) for uuid in uuids[at : at + share]],
             expires=datetime(2026, 11, 30, tzinfo=UTC),
             skipped=[(bytes(10), "revoked")] if at == 0 else [],
-            also_held_by=["5e"] if held else [],
+            also_held_by=(["7f", "5e"] if at else ["5e"]) if held else [],
             receivers=[SimpleNamespace(name="south", fingerprint="bb")],
             id="7",
         )
         for at in range(0, len(uuids), share)
     ]
+    holders = "lab 5e, lab 7f" if bundles > 1 else "lab 5e"
     head, *lines = handover._plan_text(plans, station).splitlines()
     assert head.startswith("Move 24 nodes, to be imported by 2026-11-")
     if bundles > 1:
@@ -612,7 +616,7 @@ def test_the_plan_of_an_export_names_nodes_holders_and_keys_to_compare(
     assert "4 more" in lines[20]
     assert lines[21:] == [
         f"  not {bytes(10).hex()}: revoked",
-        *(["  also held by lab 5e from an earlier copy, until the keys are rotated"] if held else []),
+        *([f"  also held by {holders} from an earlier copy, until the keys are rotated"] if held else []),
         "Compare by voice:",
         "  to   south",
         "       spoken bb",
@@ -726,3 +730,144 @@ def test_nodes_that_are_proven_already_are_not_waited_for(
     assert shown["pending"] == [uuid.hex() for uuid in waiting]
     assert shown["not_proven"] == ({UUIDS[1]: "it is silent"} if len(waiting) == 2 else {})
     assert (shown["receipt"], shown["fresh"]) == ("r", True)
+
+
+@pytest.mark.parametrize(
+    ("octets", "sealed"),
+    [
+        (b'{"recipients": [], "ciphertext": "x"}', True),
+        (b' \r\n\t{"ciphertext": "x"}', True),
+        (b"x" + b'{"ciphertext": "x"}', False),
+        (b'{"recipients": []}', False),
+        *((b"{" + b" " * blanks + b'"ciphertext": "x"}', True) for blanks in range(1, 34)),
+        (b"{" + b" " * 40 + b'"ciphertex"}', False),
+        (b"", False),
+    ],
+)
+def test_a_sealed_bundle_is_known_wherever_its_ciphertext_begins(
+    monkeypatch: pytest.MonkeyPatch, octets: bytes, sealed: bool
+) -> None:
+    """It is read piece by piece, and the word may lie across the end of one."""
+    monkeypatch.setattr(handover, "_PIECE", 16)
+    assert handover._is_sealed(BytesIO(octets)) is sealed
+
+
+@pytest.mark.parametrize(("octets", "refused"), [(40, False), (41, True)])
+def test_a_bundle_is_as_large_as_one_may_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, octets: int, refused: bool
+) -> None:
+    monkeypatch.setattr(handover, "MAX_BUNDLE_OCTETS", 40)
+    file = tmp_path / "a.jwe"
+    file.write_bytes(b'{"ciphertext": "x"}'.ljust(octets))
+    if refused:
+        why = r"is larger than 40 octets and cannot be a bundle\.$"
+        with pytest.raises(BadDataError, match=why), handover._bundle_file(file):
+            pass
+    else:
+        with handover._bundle_file(file) as bundle:
+            bundle.seek(0)
+            assert len(bundle.read()) == octets
+    file.write_bytes(b"{}")
+    with pytest.raises(BadDataError) as error, handover._bundle_file(file):
+        pass
+    assert (error.value.message, error.value.hint) == (
+        f"{file} is not a handover bundle.",
+        "Use the file that export-keys wrote.",
+    )
+
+
+def test_of_a_bundle_that_was_imported_before_the_refused_nodes_stay_refused() -> None:
+    first, second, third = (f"{number:020x}" for number in (1, 2, 3))
+    notes = SimpleNamespace(uuids=[first, second, third], refused=[(second, "it is given away")])
+    row = SimpleNamespace(peers=("5e",), mode="move", id="7")
+    done: Any = SimpleNamespace(notes=notes, row=row, refused_uuids={second})
+    found = handover._taken_before(done)
+    assert found["decisions"] == {first: "same", third: "same", second: "refused"}
+    assert (found["imported"], found["count"]) == ([first, third], 3)
+    assert found["refused"] == [{"uuid": second, "why": "it is given away"}]
+    assert (found["from"], found["id"], found["mode"], found["revoked"]) == ("5e", "7", "move", [])
+
+
+def test_of_the_nodes_with_notes_forty_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("peer_name", "spoken", "fingerprint"):
+        monkeypatch.setattr(handover, name, lambda *words: "x" * 32)
+    nodes = [
+        SimpleNamespace(node=SimpleNamespace(uuid=bytes([number]) * 10), decision="import", why="", notes=("Odd.",))
+        for number in range(45)
+    ]
+    bundle = SimpleNamespace(mode="copy", sender="5e", ca="c")
+    plan: Any = SimpleNamespace(
+        opened=SimpleNamespace(bundle=bundle), nodes=nodes, denied=[], passed_over=[], ca_is_known=True
+    )
+    lines = handover.import_text(cast(Any, SimpleNamespace(fingerprint="aa")), plan).splitlines()
+    assert sum(line.endswith(": Odd.") for line in lines) == 40
+    plan.nodes = nodes[:40]
+    lines = handover.import_text(cast(Any, SimpleNamespace(fingerprint="aa")), plan).splitlines()
+    assert (sum(line.endswith(": Odd.") for line in lines), [line for line in lines if "more" in line]) == (40, [])
+
+
+@pytest.mark.parametrize("go_on", [True, False])
+def test_of_several_receipts_that_fail_the_first_decides_how_the_command_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, go_on: bool
+) -> None:
+    errors = {"b": NotAuthenticError("It is forged."), "c": PolicyError("It was undone.")}
+
+    def close(_station: Any, octets: bytes, *, dry_run: bool) -> str:
+        name = octets.decode()
+        if name in errors:
+            raise errors[name]
+        return f"{name} {dry_run}"
+
+    monkeypatch.setattr(handover, "close", close)
+    files = [tmp_path / name for name in "abcd"]
+    for file in files:
+        file.write_text(file.name)
+    warned: list[str] = []
+    app: Any = SimpleNamespace(warn=warned.append)
+    none: Any = None
+    if not go_on:
+        with pytest.raises(NotAuthenticError):
+            handover._close_all(app, none, files, go_on=False, dry_run=True)
+        assert warned == []
+        return
+    closed, failed = handover._close_all(app, none, files, go_on=True, dry_run=True)
+    assert (closed, failed) == (["a True", "d True"], errors["b"])  # type: ignore[comparison-overlap]
+    assert warned == ["b: It is forged.", "c: It was undone."]
+
+
+def test_a_move_is_undone_as_it_is_once_the_store_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A receipt may have come while the person was asked."""
+    course: list[Any] = []
+    rows = [SimpleNamespace(id="7", mode="move", state="open"), SimpleNamespace(id="7", mode="move", state="closed")]
+
+    @contextmanager
+    def lock(command: str, _note: Any) -> Iterator[None]:
+        course.append(command)
+        yield
+        course.append("free")
+
+    station: Any = SimpleNamespace(lock=lock)
+    monkeypatch.setattr(handover, "find_handover", lambda _station, id_: rows.pop(0))
+    monkeypatch.setattr(
+        handover.handover_pending,
+        "undo",
+        lambda _station, row: course.append(row.state) or SimpleNamespace(uuids=[bytes(10)], fresh=True),
+    )
+    app: Any = SimpleNamespace(
+        station=lambda: station,
+        note=None,
+        confirm=lambda question, *, yes: course.append((question, yes)),
+        emit=lambda result, text: course.append((result, text)),
+    )
+    callback: Any = handover.undo.callback
+    callback.__wrapped__(app, "7", True, False)
+    assert course == [
+        ("Undo this move? The receiver may still have the keys until they are rotated.", True),
+        "handover undo",
+        "closed",
+        "free",
+        (
+            {"id": "7", "state": "undone", "nodes": [bytes(10).hex()], "fresh": True},
+            "1 node back on this station; each key is rotated at the next contact.",
+        ),
+    ]

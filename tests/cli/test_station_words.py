@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import pytest
 
-from teds_provision.cli.station import doctor, handover, init, trust, vault
+from teds_provision.cli.main import cli
+from teds_provision.cli.station import backup, config, doctor, handover, init, log, profile, trust, vault
 from teds_provision.doctor.checks import Finding
-from teds_provision.errors import WrongPassphraseError
+from teds_provision.errors import UsageError, VaultError, WrongPassphraseError
+from teds_provision.station.store.audit import AuditEntry
+from teds_provision.trace.record import Record
 
 from .shell import call
 
@@ -293,3 +298,250 @@ def test_the_doctor_has_a_passphrase_only_if_one_was_given_and_prints_names_of_d
     done = call(home, "doctor", passphrase=passphrase)
     assert done.out.splitlines() == ["warning  reader ?[2J  It is named a?b?c.", "  → Unplug ?it."]
     assert (systems[0].ask is not None) is asks
+
+
+def test_a_key_that_is_trusted_already_is_not_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[Any] = []
+
+    def found(name: str, *, known: bool) -> Any:
+        return SimpleNamespace(record=SimpleNamespace(role="station", name=name, fingerprint=DIGITS), known=known)
+
+    keys = [found("old", known=True), found("yes", known=False), found("no", known=False)]
+    monkeypatch.setattr(trust, "_candidates", lambda *_words: keys)
+    monkeypatch.setattr(
+        trust, "_agreed", lambda _app, key, yes: course.append((key.record.name, yes)) or key.record.name == "yes"
+    )
+    monkeypatch.setattr(
+        trust.handover_trust, "add", lambda _station, chosen: course.append([key.record.name for key in chosen]) or 1
+    )
+    app = app_with(course, SimpleNamespace())
+    for fingerprint, yes, agreed in ((None, False, False), (DIGITS, False, True), (None, True, True)):
+        course.clear()
+        run(trust.add, app, None, None, Path("keys"), "station", fingerprint, yes, False)
+        assert course[:6] == [
+            ("yes", agreed), ("no", agreed), "unlock", ("lock", "trust add"), ["old", "yes"], "free",
+        ]  # fmt: skip
+        assert course[6][1] == "Now trusted: yes."
+
+
+@pytest.mark.parametrize(
+    ("what", "words", "refused"),
+    [
+        ("name", ("bench", None), False),
+        ("name", (None, None), False),
+        ("name", ("", None), True),
+        ("name", ("mill", "file"), True),
+        ("keystore", ("bench", "keyring"), True),
+        ("keystore", (None, ""), True),
+        ("keystore", (None, "file"), False),
+    ],
+)
+def test_a_station_that_is_there_differs_from_what_was_asked_for(
+    what: str, words: tuple[str | None, str | None], refused: bool
+) -> None:
+    station: Any = SimpleNamespace(name="bench", home="/home", identity=SimpleNamespace(keystore="file"))
+    if not refused:
+        init._require_same(station, *words)
+        return
+    with pytest.raises(UsageError) as error:
+        init._require_same(station, *words)
+    has = {"name": "bench", "keystore": "file"}[what]
+    assert error.value.message == f"/home already holds a station whose {what} is {has!r}. Nothing was changed."
+    assert error.value.hint == f"Omit --{what} to show it, or choose another --home."
+
+
+def test_a_plan_for_the_key_of_an_owner_is_one_for_a_station_too(home: Path, tmp_path: Path) -> None:
+    path = tmp_path / "owner.pem"
+    path.write_bytes(b"x")
+    plan = call(home, "--json", "init", "--ca", path, "--dry-run", passphrase=None).json
+    assert (plan["plan"], "public_key" in plan) == (True, False)
+    assert "Nothing to do" in call(home, "init", "--dry-run", passphrase=None).out
+    text = call(home, "init", "--ca", path, "--keystore", "file", "--dry-run", passphrase=None).out
+    assert text.startswith(f"Plan: create the station's key, certified by the CA key of {path}, in the file keystore")
+
+
+ENTRY = AuditEntry(7, "2026-11-22T10:00:00Z", "ann", "write", None, "done", {}, "ab" * 32)
+
+
+@pytest.mark.parametrize(
+    ("detail", "text"),
+    [
+        ({}, ""),
+        ({"octets": 0, "retyped": False, "why": "", "none": None}, "octets 0, retyped false, why"),
+        ({"key": "ab" * 32}, f"key {'ab' * 8}"),
+        ({"key": "ab" * 32 + "c"}, f"key {'ab' * 32}c"),
+        ({"key": "ab" * 31}, f"key {'ab' * 31}"),
+        ({"path": "/" + "a" * 63}, f"path /{'a' * 63}"),
+        ({"nodes": ["ö"]}, 'nodes ["ö"]'),
+    ],
+)
+def test_the_details_of_an_entry_have_zeros_and_hashes_are_short(
+    monkeypatch: pytest.MonkeyPatch, detail: dict[str, Any], text: str
+) -> None:
+    monkeypatch.setattr(log, "local_time", lambda at: at)
+    head = "    7  2026-11-22T10:00:00Z  ann  write      -                     done"
+    assert log._line(replace(ENTRY, detail=detail)) == f"{head}  {text}".rstrip()
+
+
+@pytest.mark.parametrize(("columns", "width"), [(20, 40), (50, 50)])
+def test_a_narrow_terminal_has_lines_of_forty_columns(
+    monkeypatch: pytest.MonkeyPatch, columns: int, width: int
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(log.sys, "stdout", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(log.shutil, "get_terminal_size", lambda: SimpleNamespace(columns=columns))
+    monkeypatch.setattr(log, "wrap", lambda text, width, **_how: asked.append(width) or [text])
+    log._line(ENTRY)
+    assert asked == [width, width]
+
+
+def test_an_empty_time_is_none(home: Path) -> None:
+    assert call(home, "--json", "log", "--since", "").code == 2
+
+
+@pytest.mark.parametrize(
+    ("facts", "text"),
+    [
+        ({}, "nfc  >   x  0102"),
+        ({"layer": "message"}, "nfc  > x  0102"),
+        ({"sealed": True, "opened": b""}, "nfc  >   x  sealed"),
+        ({"sealed": True, "opened": b"\7"}, "nfc  >   x  sealed  07"),
+        ({"sealed": True}, "nfc  >   x  sealed  0102"),
+        ({"identifier": 0}, "nfc  >   x  00000000 0102"),
+        ({"identifier": 0x18DAF101}, "nfc  >   x  18daf101 0102"),
+        ({"octets": bytes(24)}, f"nfc  >   x  {'00' * 24}"),
+        ({"octets": bytes(25)}, f"nfc  >   x  {'00' * 24}…"),
+        ({"command": "a\x1b[2J"}, "nfc  >   a?[2J  0102"),
+    ],
+)
+def test_the_line_of_a_frame(facts: dict[str, Any], text: str) -> None:
+    record = Record(**{
+        "time": 1.0, "direction": "out", "link": "nfc", "layer": "frame", "octets": b"\1\2", "command": "x",
+    } | facts)  # fmt: skip
+    [line] = log._lines(iter([record]), whole=False)
+    assert line.partition(" ")[2] == text
+    [whole] = log._lines(iter([record]), whole=True)
+    assert whole.endswith("…") is False
+
+
+@pytest.mark.parametrize(
+    ("demand", "text"),
+    [
+        ({}, ""),
+        ({"required": True, "method": "table", "monotone": "rising"}, "required, table, rising"),
+        ({"monotone": "either"}, "monotone"),
+        ({"monotone": "falling", "interval": 365 * 86_400.0}, "falling, every 365 d"),
+        ({"interval": 1.75 * 86_400}, "every 2 d"),
+    ],
+)
+def test_what_a_type_demands_of_a_calibration(demand: dict[str, Any], text: str) -> None:
+    usual = {"required": False, "method": None, "monotone": None, "interval": None}
+    assert profile._demand(usual | demand) == text
+
+
+def test_mistakes_in_a_profile_are_counted_for_people_who_see_them_above(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "load-cell"\ntitle = "Mine"\n')
+    where = SimpleNamespace(file="mine.toml", line=2)
+
+    class Problem(SimpleNamespace):
+        def __str__(self) -> str:
+            return f"mine.toml:{self.where.line}: {self.message}"
+
+    wrong = [Problem(where=where, field="x", message=f"mistake {n}", severity="error") for n in (1, 2, 3)]
+    odd = Problem(where=where, field="x", message="odd", severity="warning")
+    monkeypatch.setattr(profile, "check_profile", lambda _path, _folders: (None, [odd, *wrong]))
+    people = call(home, "profile", "check", file)
+    assert (people.code, "Error: mine.toml:2: mistake 1 (2 more, listed above)" in people.err) == (8, True)
+    assert people.err.startswith("warning: mine.toml:2: odd\nerror: mine.toml:2: mistake 1\n")
+    assert call(home, "--json", "profile", "check", file).json["error"]["message"] == "mine.toml:2: mistake 1"
+    monkeypatch.setattr(profile, "check_profile", lambda _path, _folders: (None, wrong[:1]))
+    assert "(" not in call(home, "profile", "check", file).err
+    monkeypatch.setattr(profile, "check_profile", lambda _path, _folders: (None, [odd]))
+    good = call(home, "--json", "profile", "check", file).json["profiles"]
+    assert good == [
+        {
+            "name": "mine",
+            "file": str(file),
+            "ok": True,
+            "problems": [{"file": "mine.toml", "line": 2, "field": "x", "message": "odd", "severity": "warning"}],
+        }
+    ]
+
+
+def test_a_setting_is_that_of_the_first_command_that_takes_it_or_takes_several(home: Path) -> None:
+    """``ble`` is one adapter for most commands and several for ``ncap run``; a number may be one of several values."""
+    (home / "config.toml").write_text("[measure]\nchannel = 2\n")
+    assert call(home, "config", "show").code == 0
+    root = click.Context(cli)
+    for name, several, wanted in (
+        ("ble", False, ("provision", False)),
+        ("ble", True, ("ncap run", True)),
+        ("can", False, ("provision", True)),
+        ("show.channel", False, ("show", False)),
+        ("trust.add.role", False, ("trust add", False)),
+        ("timeout", True, ("provision", False)),
+    ):
+        found = config._parameter(root, name, several=several)
+        assert found is not None
+        assert (found[0], found[2].multiple) == wanted, (name, several)
+    named = config._parameter(root, "measure.can")
+    assert named is not None
+    assert (named[0], config._parameter(root, "measure.none")) == ("measure", None)
+
+
+def test_settings_of_the_environment_are_listed_by_name(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("TIMEOUT", "NFC", "CAN"):
+        monkeypatch.setenv(f"TEDS_PROVISION_{name}", "7")
+    shown = call(home, "--json", "config", "show").json["settings"]
+    assert [setting["name"] for setting in shown if setting["source"].startswith("environment")] == [
+        "can", "nfc", "timeout",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_a_backup_that_was_opened_is_closed_however_the_command_ends(
+    monkeypatch: pytest.MonkeyPatch, dry_run: bool
+) -> None:
+    course: list[Any] = []
+    content: Any = SimpleNamespace(
+        name="north", created="now", station=DIGITS, age_days=lambda: 3, close=lambda: course.append("content closed")
+    )
+    present: Any = SimpleNamespace(close=lambda: course.append("station closed"))
+    app = app_with(course, SimpleNamespace())
+    app.home, app.closing = Path("home"), lambda close: close()
+    monkeypatch.setattr(backup, "_open", lambda *_words: content)
+    monkeypatch.setattr(backup, "_asker", lambda *_words: None)
+    monkeypatch.setattr(backup, "open_present", lambda *_words: present)
+    monkeypatch.setattr(backup, "_merge", lambda *_words, yes, dry_run: course.append((yes, dry_run)))
+    run(backup.restore, app, Path("b"), None, None, None, True, dry_run)
+    assert course == ["content closed", "station closed", (True, dry_run)]
+
+
+@pytest.mark.parametrize(
+    ("error", "hint"),
+    [
+        (WrongPassphraseError("Wrong."), ""),
+        (
+            VaultError("It is no key."),
+            "A recovery key is an encrypted PEM file: openssl genpkey -algorithm EC -pkeyopt "
+            "ec_paramgen_curve:P-256 -aes256 -out recovery.pem",
+        ),
+    ],
+)
+def test_a_recovery_key_that_is_none_says_how_to_make_one_and_a_wrong_passphrase_is_one(
+    monkeypatch: pytest.MonkeyPatch, error: VaultError, hint: str
+) -> None:
+    def read(*_words: object) -> None:
+        raise error
+
+    monkeypatch.setattr(backup, "SealedFile", lambda _file: SimpleNamespace(is_for_key=True))
+    monkeypatch.setattr(backup, "read_ca", read)
+    with pytest.raises(type(error)) as failed:
+        backup._open(Path("b"), Path("key.pem"), lambda prompt, _confirm: prompt)
+    assert (failed.value.message, failed.value.hint) == (error.message, hint)
+    with pytest.raises(UsageError) as refused:
+        backup._open(Path("b"), None, lambda prompt, _confirm: prompt)
+    assert refused.value.hint == "Pass it with --recovery-key PEM."

@@ -191,12 +191,17 @@ def _result_of(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: St
         "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
         "nodes": [node.uuid.hex() for plan in plans for node in plan.nodes],
         "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
-        "also_held_by": sorted({digits for plan in plans for digits in plan.also_held_by}),
+        "also_held_by": _other_holders(plans),
         "bundles": [
             {"bundle": None if output is None else str(output), "id": pair.id, "count": len(pair.nodes)}
             for pair, output in zip_longest(plans, outputs)
         ],
     }
+
+
+def _other_holders(plans: Sequence[ExportPlan]) -> list[str]:
+    """Return the fingerprints of the stations that hold a copy of a key of any bundle."""
+    return sorted({digits for plan in plans for digits in plan.also_held_by})
 
 
 def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
@@ -205,8 +210,9 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
     lines += first_lines(_node_lines(chosen[:_LEAVING_SHOWN], station), _LEAVING_SHOWN, len(chosen))
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
-    if plan.also_held_by:
-        names = ", ".join(peer_name(station, digits) for digits in plan.also_held_by)
+    holders = _other_holders(plans)
+    if holders:
+        names = ", ".join(peer_name(station, digits) for digits in holders)
         lines.append(f"  also held by {names} from an earlier copy, until the keys are rotated")
     lines.append("Compare by voice:")
     lines += [f"  to   {record.name}\n       {spoken(record.fingerprint)}" for record in plan.receivers]
