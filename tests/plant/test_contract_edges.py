@@ -50,6 +50,9 @@ def test_a_document_has_the_type_and_at_most_the_octets_of_its_kind(kind: Docume
     assert kind.typ == typ
     with pytest.raises(BadDataError, match=f"at most {most} "):
         open_document(b"." * (most + 1), lambda kid: None, kind)
+    if kind is document.MEMBER_REQUEST:
+        with pytest.raises(BadDataError, match=f"at most {most} "):
+            document.open_request(b"." * (most + 1))
     with pytest.raises(TedsProvisionError) as error:
         open_document(b"." * most, lambda kid: None, kind)
     assert "at most" not in error.value.message

@@ -230,3 +230,141 @@ def test_a_node_that_fails_does_not_reply_and_takes_the_next_command(
     assert (line.waiting, replies, scene.lost) == (1, [], [])
     job()
     assert (line.waiting, replies, scene.lost) == (0, [b"\1\0\0"], [line.name])
+
+
+class Connected:
+    """A peripheral with one connection, whose jobs wait until the test runs them."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.peripheral, self.jobs = scene, scene.peripheral, list[Any]()
+        self.drained, self.ended = list[str](), list[Any]()
+        self.connection: Any = SimpleNamespace(
+            att_mtu=100, drain=self._drain, on=lambda event, call: self.ended.append((event, call))
+        )
+        self.peripheral._connected(self.connection)
+        self.line = self.peripheral._lines[2]
+        self.line.jobs = cast("Any", SimpleNamespace(put=self.jobs.append))
+        self.calls: list[tuple[object, ...]] = []
+        node: Any = scene.peripheral._node
+        node.tick = lambda: 4711
+        node.unheard = lambda name: self.calls.append(("unheard", name))
+        node.drive = lambda name, message: self.calls.append(("drive", name, message))
+
+    async def _drain(self) -> None:
+        self.drained.append("drained")
+        raise OSError("the connection has ended meanwhile")
+
+    def run(self) -> None:
+        while self.jobs:
+            self.jobs.pop(0)()
+
+
+@pytest.fixture
+def connected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connected:
+    return Connected(Scene(tmp_path, monkeypatch, factory=False))
+
+
+def test_data_go_to_a_connection_that_has_asked_for_them(connected: Connected) -> None:
+    sent: list[tuple[object, ...]] = []
+
+    async def notify(*what: object) -> None:
+        sent.append(what)
+
+    connected.scene.device.notify_subscriber = notify  # type: ignore[attr-defined]
+    connected.peripheral._data = "the characteristic"
+
+    def send(number: int) -> None:
+        asyncio.run(connected.peripheral.notify_data(number, b"data"))
+
+    send(2)
+    send(3)
+    assert (sent, connected.drained) == ([], []), "it has not asked for any, and the other is not there"
+    connected.peripheral._subscribed(connected.connection, True, False)
+    connected.peripheral._subscribed(SimpleNamespace(), False, False)
+    send(2)
+    assert (sent, connected.drained) == ([(connected.connection, "the characteristic", b"data")], ["drained"])
+    assert connected.jobs == []
+    connected.peripheral._subscribed(connected.connection, False, False)
+    connected.run()
+    send(2)
+    assert (len(sent), connected.calls) == (1, [("unheard", "ble:2")])
+
+
+@pytest.mark.parametrize(
+    ("octets", "driven"), [(b"\0message", b"message"), (b"\0", b""), (b"\1message", None), (b"", None)]
+)
+def test_a_drive_message_comes_under_stream_0(connected: Connected, octets: bytes, driven: bytes | None) -> None:
+    connected.peripheral._driven(SimpleNamespace(), b"\0of a stranger")
+    connected.peripheral._driven(connected.connection, octets)
+    connected.run()
+    assert connected.calls == ([] if driven is None else [("drive", "ble:2", driven)])
+
+
+def test_of_commands_that_wait_a_connection_has_four(connected: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[int, bytes, int]] = []
+
+    def job(line: object, received: Any, tick: int, _loop: object) -> Any:
+        assert line is connected.line
+        made.append((received.transaction, received.message, tick))
+        return made.clear
+
+    monkeypatch.setattr(connected.peripheral, "_job", job)
+
+    async def write(connection: object, *pieces: str) -> None:
+        for piece in pieces:
+            connected.peripheral._written(connection, bytes.fromhex(piece))
+
+    whole = [f"000{number} 0003 0000 616263" for number in range(1, 7)]
+    asyncio.run(write(SimpleNamespace(), whole[0]))
+    asyncio.run(write(connected.connection, "0001 0003 0000 61"))
+    assert (made, connected.line.waiting) == ([], 0), "a stranger's, and one that is not whole"
+    asyncio.run(write(connected.connection, "0001 0003 0001 6263", *whole[1:]))
+    assert made == [(number, b"abc", 4711) for number in range(1, 5)]
+    assert (connected.line.waiting, len(connected.jobs)) == (4, 4)
+
+
+def test_a_number_is_free_again_once_the_session_of_its_connection_has_ended(connected: Connected) -> None:
+    scene, peripheral, line = connected.scene, connected.peripheral, connected.line
+    line.repetition.answer(1, b"\0\0\x80\1\0\0", lambda _: b"kept", now=0.0)
+    peripheral._news.clear()
+    ((event, gone),) = connected.ended
+    assert event == "disconnection"
+    gone(19)
+    assert peripheral._news.is_set()
+    assert (line.gone, peripheral._lines, scene.lost) == (True, {}, [])
+    assert line.repetition.answer(1, b"\0\0\x80\1\0\0", lambda _: b"again", now=0.0) == b"again"
+    peripheral._disconnected(line)
+    assert len(connected.jobs) == 1, "it is gone once"
+    peripheral._news.clear()
+    assert scene.connect() == "ble:3", "the session of the first has not ended"
+    assert peripheral._news.is_set()
+    connected.run()
+    assert scene.lost == ["ble:2"]
+    assert scene.connect() == "ble:2"
+    peripheral._news.clear()
+    peripheral.tapped()
+    assert peripheral._news.is_set()
+
+
+def test_advertising_begins_once_and_anew_under_a_new_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, log = Scene(tmp_path, monkeypatch, factory=False), list[str]()
+
+    async def start(**_: object) -> None:
+        log.append("start")
+
+    async def stop() -> None:
+        log.append("stop")
+
+    async def command(_: object) -> None:
+        log.append("address")
+
+    monkeypatch.setattr(scene.device, "start_advertising", start)
+    monkeypatch.setattr(scene.device, "stop_advertising", stop)
+    monkeypatch.setattr(scene.device, "send_sync_command", command)
+    scene.look()
+    scene.look()
+    assert log == ["start"]
+    scene.factory = True
+    scene.peripheral.tapped()
+    scene.look()
+    assert log == ["start", "stop", "address", "start"], "a controller refuses another address while it advertises"
