@@ -180,6 +180,36 @@ def test_a_rotation_that_is_due_is_noted_once_with_why(
         opened.keys.remove(uuid)
 
 
+def test_keys_of_a_removed_stations_pages_that_do_not_count_are_known_as_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it wrote after its last page, and on another history below it, shows what else it had."""
+
+    def page(*keys: tuple[bytes, int]) -> Any:
+        events = [{"uuid": uuid, "epoch": epoch} for uuid, epoch in keys]
+        return stub(content={"events": [*events, "junk", {"uuid": None}]})
+
+    kept = {(1, "h1"): page((A, 1)), (2, "h2"): page((A, 2)), (2, "other"): page((B, 7)), (4, "gone"): None}
+    kept[3, "h3"] = page((A, 3), (B, 8))
+    chains = {WEST: stub(id=1, counted=(2, "h2")), SOUTH: stub(id=2, counted=(0, ""))}
+    pages = stub(
+        chains=lambda: chains, chain_links=lambda of: [(n, hash, "") for n, hash in kept] if of == 1 else [],
+        get=lambda of, n, hash: kept[n, hash],
+    )  # fmt: skip
+
+    def read(value: Any) -> Any:
+        if value == "junk":
+            return "it has no act"
+        members = {"epoch": value["epoch"], "key_id": "k"} if value["uuid"] else {}
+        return removed_members.event.Event("agreed", "id", "at", value["uuid"], members)
+
+    monkeypatch.setattr(removed_members, "counted_places", lambda *_: {(1, "h1"), (2, "h2")})
+    monkeypatch.setattr(removed_members, "load_exact", lambda content, _what: content)
+    monkeypatch.setattr(removed_members.event, "read", read)
+    roster: Any = stub(removed=[stub(fingerprint=digits) for digits in (WEST, SOUTH, "aa" * 32)])
+    assert removed_members._beyond(stub(plant=stub(pages=pages)), roster) == {
+        (B, 7, "k"): {WEST}, (A, 3, "k"): {WEST}, (B, 8, "k"): {WEST}
+    }  # fmt: skip
+
+
 def test_an_alarm_and_a_roster_are_entries_with_whom_they_are_about(opened: Station, log: Log) -> None:
     for again, why in ((False, "first"), (False, "it lasts"), (True, "once more")):
         apply_pages.alarm(opened, "junk", WEST, 3, why, again=again)

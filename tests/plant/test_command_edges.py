@@ -380,6 +380,11 @@ def test_a_history_is_accepted_while_no_sync_runs(home: Path, roster: Roster, mo
     ("words", "message"),
     [
         (("export-keys", "--to", "west", NODE), "Give one of --output FILE and --send."),
+        (("export-keys", "--to", "west", "--all"), "Give one of --output FILE and --send."),
+        (
+            ("export-keys", "--to", "west", "--to", "o", "--all", "--send"),
+            "A parcel is for one station: give --to once.",
+        ),
         (("export-keys", "--to", "west", NODE, "--send", "--output", "x"), "Give one of --output FILE and --send."),
         (("export-keys", "--to", "west", "--to", "o", NODE, "--send"), "A parcel is for one station: give --to once."),
         (("import-keys",), "Give one of FILE and --received."),

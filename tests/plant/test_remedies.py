@@ -18,6 +18,7 @@ from teds_provision.errors import (
     ForkError,
     KeyMismatchError,
     LinkError,
+    NotAuthenticError,
     NotFoundError,
     PolicyError,
     RosterExpiredError,
@@ -106,6 +107,29 @@ def test_a_roster_that_cannot_be_joined_is_named_with_what_the_owner_must_do(mon
     for rosters in ([], [roster(member=lambda _: None)]):
         found[:] = rosters
         refused(join, NotFoundError, "No roster in the stick that this owner's CA signed names this station.", request)
+    strangers = [b"foreign", b"junk", b"foreign"]
+
+    def opened(octets: Any, _ca: bytes) -> Any:
+        if isinstance(octets, bytes):
+            raise NotAuthenticError("Another CA signed it.") if octets != b"newer" else BadDataError("Of a newer form.")
+        return octets
+
+    with monkeypatch.context() as patch:
+        patch.setattr(membership, "open_roster", opened)
+        for rosters in ([b"foreign"], strangers, strangers[:2], [b"newer", b"foreign"]):
+            found[:] = rosters
+            refused(
+                join, PolicyError,
+                "Every roster in the stick is signed by another CA than this station's, so it cannot join.",
+                NEW_STATION,
+            )  # fmt: skip
+        for others in ([b"junk"], [b"newer"], [*strangers, roster(member=lambda _: None)]):
+            found[:] = others
+            refused(
+                join, NotFoundError, "No roster in the stick that this owner's CA signed names this station.", request
+            )
+        found[:] = [*strangers, mine := roster()]
+        assert join() is mine
     found[:] = [roster(), roster(registry="r2")]
     refused(join, PolicyError, "the stick contains rosters of 2 registries.", "Choose one: --roster FILE")
     found[:] = [roster(created=NOW + day + timedelta(seconds=1), expires=NOW + 90 * day)]
@@ -373,6 +397,14 @@ def test_a_job_that_cannot_be_worked_on_is_refused_with_whom_to_ask(
         f"Profile cell is not the one in the job: {path}, with all that it extends, has a different SHA-256.",
         f"Copy the job's profile, and those that it extends, to {tmp_path / 'profiles'}.",
     )  # fmt: skip
+    (tmp_path / "0b5f").mkdir()
+    (tmp_path / "file").write_bytes(b"a job")
+    with monkeypatch.context() as patch:
+        patch.chdir(tmp_path)
+        patch.setattr(jobs, "job_row", lambda _station, text: stub(octets=f"kept {text}"))
+        patch.setattr(jobs, "read_job", lambda _station, octets: octets)
+        patch.setattr(jobs, "take_job", lambda _station, octets: octets)
+        assert [cast("Any", jobs.find_job(stub(), text)) for text in ("0b5f", "file")] == ["kept 0b5f", b"a job"]
     monkeypatch.setattr(jobs, "take_received", lambda _: None)
     rows = [stub(id="0b5f1"), stub(id="0b5f2")]
     station = stub(plant=stub(line=stub(jobs=lambda: rows, job=lambda _: None)))

@@ -80,6 +80,8 @@ def test_an_entry_must_meet_all_criteria(log: Store, choice: dict[str, Any], num
         ({"act": "no such"}, 1, 6),  # nothing: all that follows the end
         ({"since": "2026-01-03T08:00:00Z"}, None, 2),
         ({"since": "2027-01-01T00:00:00Z"}, None, 6),
+        ({"since": "2026-01-06T08:00:00Z"}, None, 5),
+        ({"since": "2026-01-06T08:00:01Z"}, None, 6),
         ({"since": "2026-01-03T08:00:00Z"}, 2, 4),
         ({"act": "write", "since": "2026-01-01T00:00:00Z"}, None, 0),
         ({"act": "write"}, None, 0),

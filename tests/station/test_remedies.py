@@ -57,6 +57,9 @@ def test_a_name_of_a_group_and_its_nodes_are_the_users_choice(store: Store, tmp_
         refused(lambda: kept.create(name, []), UsageError, f"{name!r} is not a valid group name.", rule)  # noqa: B023
     kept.create("left hand", [NODE])
     kept.create("left hand", [NODE])
+    pair = kept.create("pair", [OTHER, NODE, OTHER])
+    assert kept.create("pair", [NODE, OTHER]) == kept.create("pair", [OTHER, NODE]) == pair
+    assert pair.uuids == (NODE, OTHER)
     refused(
         lambda: kept.create("left hand", [OTHER]), UsageError, "Group 'left hand' already exists.",
         "Add nodes to it: group add 'left hand' UUID …",

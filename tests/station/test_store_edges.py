@@ -616,6 +616,41 @@ def test_a_dump_that_breaks_a_reference_or_finds_no_room(store: Store, monkeypat
     )  # fmt: skip
 
 
+DAMAGED = "A row of the store in the backup is damaged."
+
+
+def test_rows_of_a_backup_come_a_table_and_a_chunk_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dump, "CHUNK", 2)
+    end = dump._HEAD.pack(dump._END, 0)
+    rows = [(0, (1, None)), (0, ("é", b"\0")), (0, (-1, 0.5)), (2, ("x",)), (1, (2,))]
+    octets = b"".join(dump._record(number, row) for number, row in rows)
+    assert list(dump._chunks(cast("Any", Dump(octets + end)), [2, 1, 1])) == [
+        (0, [(1, None), ("é", b"\0")]), (0, [(-1, 0.5)]), (2, [("x",)]), (1, [(2,)])
+    ]  # fmt: skip
+    assert list(dump._chunks(cast("Any", Dump(end)), [2])) == []
+    one = dump._record(0, ("12345",))
+    monkeypatch.setattr(dump, "MAX_RECORD_OCTETS", 10)
+    assert list(dump._chunks(cast("Any", Dump(one + end)), [1])) == [(0, [("12345",)])]
+    for damaged in (dump._HEAD.pack(1, 0), dump._HEAD.pack(0, 11), dump._HEAD.pack(dump._END, 1)):
+        with pytest.raises(BadDataError, match=DAMAGED):
+            list(dump._chunks(cast("Any", Dump(one + damaged + end)), [1]))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"", b"\0\0", b"\1\0\0\0", b"\4\0\0", b"\2\0\0\0\5four", b"\3\0\0\0\5four", b"\2\0\0\0\2\xff\xff",
+        b"\5\0\0\0\0",
+    ],
+)  # fmt: skip
+def test_a_row_of_a_backup_that_is_not_of_its_form_is_damaged(body: bytes) -> None:
+    assert dump._row(b"\2\0\0\0\4four", 1) == ("four",)
+    assert dump._row(b"\3\0\0\0\0\0", 2) == (b"", None)
+    with pytest.raises(BadDataError) as error:
+        dump._row(body, 1)
+    assert error.value.message == DAMAGED
+
+
 def test_a_row_that_no_backup_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dump, "MAX_RECORD_OCTETS", 10)
     assert len(dump._record(0, (b"12345",))) == dump._HEAD.size + 10
