@@ -195,6 +195,7 @@ ROWS: list[Row] = [
     ("trigger-token", "128.16", 1, _shorter, "Clock (128.16)"),
     ("confirm-ends-sessions", "128.7", -2, _identity(epoch=1), "After Confirm the epoch is not"),
     ("rotation-keeps", "128.7", -1, _identity(sequence=1), "Confirm took the sequence"),
+    ("rotation-keeps", "128.7", -1, _identity(state=NodeState.KEYED), "provisioned became keyed"),
     ("rotation-keeps", "1.2", 3, lambda payload: payload[:-1] + bytes([payload[-1] ^ 1]), "its TEDS are not"),
     ("reset", "128.7", 2, _identity(state=NodeState.KEYED), "After Reset the node is keyed"),
     ("identify", "128.7", 1, _shorter, "Identify (128.7): "),

@@ -165,6 +165,12 @@ def test_without_factory_a_factory_node_is_left_as_it_was(station: Station) -> N
     assert not names(report, "failed")
     tried = {rule.name for rule in RULES if rule.stage in (Stage.PLAIN, Stage.FACTORY)}
     assert names(report, "passed") == tried - OF_FRAMES - OF_CAN
+    why = {check.rule: check.detail for check in report.checks}
+    for rule in RULES:
+        if rule.stage in (Stage.KEYED, Stage.SESSION, Stage.MEASURING):
+            assert why[rule.name] == "The node has no key. Ask with --factory to give it one."
+        elif rule.stage not in (Stage.PLAIN, Stage.FACTORY):
+            assert why[rule.name] == "Changes the node's key. Ask with --factory."
 
 
 def test_a_node_from_before_about_breaks_no_rule(station: Station) -> None:

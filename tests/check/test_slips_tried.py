@@ -14,6 +14,7 @@ from teds_provision.check.agreement_rules import StrangerStation
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError
 from teds_provision.check.run import _Run
 from teds_provision.check.slips import Slip
+from teds_provision.errors import BadDataError, GarbledError, LinkError, NotAuthenticError, PolicyError
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, verify
 from teds_provision.protocol.messages.frames import Command, Reply, TedsStatus
 from teds_provision.protocol.messages.identity import Identity, NodeState
@@ -454,3 +455,133 @@ def test_of_the_frames_of_a_bus_those_of_the_stream_itself_make_its_messages(fd:
     probe: Any = SimpleNamespace(now=lambda: 0.0, contact=SimpleNamespace(address=17))
     asked: Any = SimpleNamespace(stream=1)
     assert measuring_rules._messages(probe, frames, asked, 30, 3, 1.0) == [wanted, wanted]
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error", [NotAuthenticError("No tag."), PolicyError("Another key."), BadDataError("No point on the curve.")]
+)
+@pytest.mark.parametrize("point", [True, False])
+def test_a_reply_to_request_that_this_station_does_not_accept_breaks_the_rule(
+    monkeypatch: pytest.MonkeyPatch, error: Any, point: bool
+) -> None:
+    """Without a point nothing more can be derived from it; with one the slip is looked for."""
+
+    class Agreement:
+        def __init__(self, *_: Any, **__: Any) -> None: ...
+
+        def request(self) -> Command:
+            return Command(0, 128, 1, bytes(259))
+
+        def accept(self, *_: Any, **__: Any) -> Any:
+            raise error
+
+    made = SimpleNamespace(
+        en=NODE.point if point else bytes(65), shared=b"", transcripts=lambda: [(None, b"t")],
+        material=lambda *_: [(None, bytes(64))],
+    )  # fmt: skip
+    monkeypatch.setattr(agreement_rules, "StationAgreement", Agreement)
+    monkeypatch.setattr("teds_provision.check.slips.Agreement", lambda *_: made)
+    monkeypatch.setattr(agreement_rules, "_explained", lambda _made, otherwise: RuleBrokenError(f"so: {otherwise}"))
+    probe: Any = SimpleNamespace(
+        uuid=UUID, teds=lambda _: b"", plain=lambda _command: Reply(True, bytes(165)),
+        security=lambda: SimpleNamespace(node_key=NODE.point),
+    )  # fmt: skip
+    credentials = StrangerStation.make().credentials
+    if not point:
+        with pytest.raises(RuleBrokenError) as broken:
+            agreement_rules.try_agreement(probe, credentials)
+        assert str(broken.value) == f"Request (128.1): {error.message}"
+        return
+    tried = agreement_rules.try_agreement(probe, credentials)
+    assert (str(tried.broken), tried.agreed, len(tried.okm)) == (f"so: {error.message}", None, 48)
+
+
+@pytest.mark.parametrize("error", [GarbledError("Torn."), NotAuthenticError("No tag.")])
+def test_a_sealed_reply_that_does_not_open_breaks_the_rule_and_ends_the_session(
+    monkeypatch: pytest.MonkeyPatch, error: Any
+) -> None:
+    def unseal(_octets: bytes) -> Any:
+        raise error
+
+    looked: list[Any] = []
+    monkeypatch.setattr("teds_provision.check.probe.slips.of_sealed_reply", lambda *words: looked.append(words))
+    notes: list[Any] = []
+    rig: Any = SimpleNamespace(
+        octets=lambda *_, **__: Reply(True, b"sealed"), session="open",
+        contact=SimpleNamespace(note=lambda *words, **_: notes.append(words)),
+    )  # fmt: skip
+    session: Any = SimpleNamespace(
+        seal=lambda _command: Command(0, 128, 4, b"\0\0\0\7rest"), unseal=unseal, keys="keys"
+    )
+    with pytest.raises(RuleBrokenError) as broken:
+        Probe._sealed(rig, session, Command(0, 128, 7, b""))
+    assert str(broken.value) == f"Identify (128.7), 0 octets, sealed: {error.message}"
+    assert (rig.session, looked, len(notes)) == (None, [("keys", b"sealed", 7)], 1)
+
+
+@pytest.mark.parametrize("error", [RuleBrokenError("torn"), LinkError("silent")])
+def test_a_board_that_moved_without_a_whole_reply_is_found_at_its_new_address(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def sealed(_command: Command) -> Reply:
+        raise error
+
+    monkeypatch.setattr(session_rules, "MultiStationLink", SimpleNamespace)
+    moves: list[int] = []
+    for there, found in ((UUID, "the node is there now"), (bytes(10), str(error)), (None, str(error))):
+        identity = None if there is None else Identity(there, NodeState.KEYED, 1, 0, 512, 70)
+        link = SimpleNamespace(identify_at=lambda _address, identity=identity: identity)
+        probe: Any = SimpleNamespace(
+            session="open", sealed=sealed, contact=SimpleNamespace(link=link), uuid=UUID, move=moves.append
+        )
+        with pytest.raises((RuleBrokenError, LinkError)) as raised:
+            session_rules._moved(probe, 17, 70)
+        assert found in str(raised.value)
+    assert moves == [70]
+
+
+@pytest.mark.parametrize("error", [BadDataError("No."), NotAuthenticError("No."), PolicyError("No.")])
+def test_a_node_that_cannot_be_reset_fails_the_rule_reset(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def fails(*_: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr("teds_provision.check.run.examine", lambda *_: None)
+    monkeypatch.setattr("teds_provision.check.run.reset_node", fails)
+    rig: Any = SimpleNamespace(_station=None, _node=None, _checks={}, _probe=SimpleNamespace(key=KEY))
+    assert _Run._reset(rig) == "The node could not be reset. No."
+    failed = rig._checks["reset"]
+    assert (failed.rule, failed.result, failed.detail, rig._probe.key) == ("reset", "failed", "No.", KEY)
+    monkeypatch.setattr("teds_provision.check.run.reset_node", lambda *_: None)
+    assert _Run._reset(rig) == ""
+    assert (rig._probe.key, rig._probe.session, rig._probe.no_session, rig._probe.no_agreement) == (None, None, "", "")
+
+
+@pytest.mark.parametrize("error", [RuleBrokenError("torn"), NotApplicableError("no TEDS")])
+def test_the_boards_own_teds_that_cannot_be_restored_keep_it_from_no_reset(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """A rule has reported the fault already; the node still gets its next key, and goes back to factory state."""
+
+    def restore(_probe: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(measuring_rules, "restore", restore)
+    stages, removed = list[str](), list[bytes]()
+    station = SimpleNamespace(
+        credentials=lambda: "own", durable=lambda _what: nullcontext(), audit=lambda *_, **__: None,
+        keys=SimpleNamespace(remove=removed.append),
+    )  # fmt: skip
+    rig: Any = SimpleNamespace(
+        _probe=SimpleNamespace(key=KEY), _station=station, _keep=None, _node=SimpleNamespace(uuid=UUID),
+        _stage=lambda stage: stages.append(stage.name), _checks={"reset": SimpleNamespace(result="passed")},
+    )  # fmt: skip
+    _Run._key_and_back(rig, sessions_too=True)
+    assert stages == ["AGREEMENT", "KEYED", "SESSION", "COMMIT", "MEASURING", "ROTATION", "RESET"]
+    assert removed == [UUID]
+    rig._checks["reset"] = SimpleNamespace(result="failed")
+    _Run._key_and_back(rig, sessions_too=False)
+    assert stages[7:] == ["AGREEMENT", "COMMIT", "MEASURING", "ROTATION", "RESET"]
+    assert removed == [UUID], "a node that was not reset still has the key"

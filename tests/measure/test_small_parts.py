@@ -54,6 +54,16 @@ def test_before_the_refit_a_stamp_has_the_whole_residue_and_after_the_slew_none(
     assert list(at.values()) == [1080.0, 1080.0, pytest.approx(1060.0), 1000.0, 1000.0]
 
 
+def test_ticks_and_times_of_years_are_whole_nanoseconds() -> None:
+    """2^60 ns are 36 years; as floats they would have steps of 128 ns."""
+    made = ClockMap()
+    made._offset = 0.25
+    large = 2**60 + 1
+    host, rate, _ = made.line(large, large + 10)
+    assert (host, type(host), rate) == (large, int, 1.0)
+    assert (made.tick_at(large), type(made.tick_at(large))) == (large, int)
+
+
 # -- streams -----------------------------------------------------------------------------------------------------------
 
 

@@ -164,15 +164,16 @@ def _parquet(path: Path, entries: list[Any], *facts: Any, wide: bool = False) ->
 
 def test_rows_of_one_time_keep_their_order_and_an_unknown_clock_error_is_null(tmp_path: Path) -> None:
     """Sorted by time across nodes; a sort that is not stable mixes rows of a clock that stood still."""
-    n = 300
-    first = block(np.arange(n).reshape(n, 1), period=0.0, clock_error=None)
-    other = block(np.arange(n).reshape(n, 1), uuid=HAND, period=0.0, clock_error=0.5)
+    n, times = 300, 1_795_000_000.0 + np.repeat([0.0, 1.0, 2.0], 100)
+    first = replace(block(np.arange(n).reshape(n, 1), clock_error=None), time=times)
+    other = replace(block(np.arange(n).reshape(n, 1), uuid=HAND, clock_error=0.5), time=times)
     facts = (ANGLE, replace(ANGLE, uuid=HAND, node="hand"))
     _parquet(tmp_path / "run.parquet", [first, other], *facts)
     table = pq.read_table(tmp_path / "run.parquet")
-    assert table.column("uuid").to_pylist() == [ARM] * n + [HAND] * n
-    assert table.column("index").to_pylist() == [*range(n), *range(n)]
-    assert table.column("clock_error").to_pylist() == [None] * n + [0.5] * n
+    assert table.column("uuid").to_pylist() == ([ARM] * 100 + [HAND] * 100) * 3
+    hundreds = [list(range(begin, begin + 100)) for begin in (0, 0, 100, 100, 200, 200)]
+    assert table.column("index").to_pylist() == [index for hundred in hundreds for index in hundred]
+    assert table.column("clock_error").to_pylist() == ([None] * 100 + [0.5] * 100) * 3
 
 
 def test_a_channel_with_gaps_is_read_and_its_large_raw_values_stay_exact(tmp_path: Path) -> None:
