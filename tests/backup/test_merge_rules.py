@@ -108,6 +108,43 @@ def test_what_the_copy_alone_has(two: Two, what: str, put: Put, comes_back_from:
         assert (dict(done.back), dict(done.kept)) == ({}, {}), "both have the same"
 
 
+def put_a_row_of_each_kind(station: Station, uuid: bytes) -> None:
+    point = {A: POINT, B: POINT2}[uuid]
+    digits, gone = fingerprint(point), b"\1" + uuid[1:]  # a node that is banned and given away has nothing else
+    station.policy.deny(RevocationRecord(gone, None, "lost", f"s.{digits}", AT))
+    station.policy.put_tombstone(Tombstone(gone, KEY, "h", AT))
+    station.handovers.put(replace(HANDOVER, id=uuid.hex()))
+    station.keys.put_holder(Holder(uuid, KEY, AT))
+    station.nodes.restore(NodeRecord(uuid, point, epoch=2))
+    station.groups.put(Group(f"group {digits}", (uuid,), AT))
+    station.pins.restore([WhitelistEntry(uuid, digits, AT)])
+    station.keys.add(key(uuid, 3))
+    station.policy.restore_trust(TrustRecord(f"ca {digits[:4]}", "ca", point, digits, AT))
+    station.policy.restore_ended_ca(f"{uuid.hex():0>64}", b"m" * 16)
+    station.policy.restore_lifted(f"{uuid.hex():0>64}", b"m" * 16)
+    station.identity.put_certificate(digits, KEY2, bytes(64))
+    station.keys.put_flags({uuid: KeyFlags(rotation="why")})
+    station.measurements.rename(uuid, 0, f"name {digits[:4]}")
+    station.measurements.set_frame(uuid, 0, f"frame {digits[:4]}")
+
+
+@pytest.mark.parametrize("known", [A, B, None], ids=["the first", "the second", "none"])
+def test_a_row_that_is_missing_here_comes_back_beside_one_that_is_known(two: Two, known: bytes | None) -> None:
+    if known is not None:
+        put_a_row_of_each_kind(two.live, known)
+    for uuid in (A, B):
+        put_a_row_of_each_kind(two.copy, uuid)
+    done = two.merged(NEWER)
+    missing = [fingerprint(point)[:4] for uuid, point in ((A, POINT), (B, POINT2)) if uuid != known]
+    kinds = (
+        "revocations", "tombstones", "handovers", "holders", "nodes", "groups", "whitelist", "keys",
+        "CAs whose trust has ended", "bans lifted", "certificates", "marks", "names", "frames",
+    )  # fmt: skip
+    trust = {f"trust in ca ca {digits}": 1 for digits in missing}
+    assert dict(done.back) == dict.fromkeys(kinds, len(missing)) | trust
+    assert dict(done.kept) == {}
+
+
 NODE = NodeRecord(A, POINT, "old", epoch=3, sequence=5)
 
 
@@ -252,6 +289,13 @@ def test_a_datasheet_that_is_missing_here_comes_back_and_a_draft_unless_the_copy
     assert [row.image.blocks for row in two.live.datasheets.whole_history(A)] == [{(0, 1): b"a"}]
     assert two.live.datasheets.drop_draft(A)
     assert two.merged(NEWER).back["drafts"] == 1
+    for octets in (b"b", b"c"):
+        two.copy.datasheets.put(Image(A, {(0, 1): octets}))
+    assert dict(two.merged(OTHER).back) == {}
+    assert dict(two.merged(NEWER).back) == {"datasheets": 1}
+    history = two.live.datasheets.whole_history(A)
+    assert history == two.copy.datasheets.whole_history(A)
+    assert [row.image.blocks[0, 1] for row in history] == [b"c", b"b", b"a"], "newest first"
 
 
 def test_a_flag_of_an_older_copy_comes_with_a_key_that_is_missing_here_alone(two: Two) -> None:
@@ -291,9 +335,13 @@ def test_what_a_person_ended_here_stays_ended(two: Two, how: Relation) -> None:
     ended = {entry.act: entry.at for entry in two.live.audit_log.entries()}
     two.copy.policy.restore_trust(replace(TRUSTED, added=ended["trust"]))
     two.copy.pins.restore([WhitelistEntry(A, KEY, ended["decommission"])])  # of the same second
+    for before, after in ((b"\0", "a"), (b"\xff", "z")):  # what stays out ends nothing
+        two.copy.policy.deny(RevocationRecord(before * 10, None, "lost", f"{after}.other.c", AT))
+        point = SoftwareKey(123 + before[0]).point
+        two.copy.policy.restore_trust(TrustRecord(after, "ca", point, fingerprint(point), AT))
     two.live.policy.restore_lifted(hash_of_statement(ban.statement), b"m" * 16)
     done = two.merged(how)
-    assert dict(done.back) == {}
+    assert dict(done.back) == {"revocations": 2, "trust in ca a": 1, "trust in ca z": 1}
     assert dict(done.kept) == {
         "keys no longer trusted since": 1, "bans lifted since": 1, "nodes taken out of service since": 1,
     }  # fmt: skip
@@ -341,6 +389,10 @@ def test_kept_measurements_come_from_a_copy_that_is_not_older(two: Two) -> None:
     assert two.merged(OTHER).back["measurements"] == 0
     assert two.merged(NEWER).back["measurements"] == 1
     assert two.live.measurements.lasting() == [changed]
+    more = [two.copy.measurements.keep(KeptMeasurement(name, group="hand")) for name in ("m0", "m3")]
+    assert two.merged(OTHER).back["measurements"] == 2, "one that is known ends nothing"
+    assert sorted(kept.id for kept in two.live.measurements.lasting()) == ["m0", "m1", "m3"]
+    assert {kept.id for kept in more} == {"m0", "m3"}
 
 
 @pytest.mark.parametrize("how", [OTHER, NEWER])
@@ -353,10 +405,14 @@ def test_names_and_frames_of_a_node_that_is_measured_stay_as_they_are(two: Two, 
         done = two.merged(how)
         assert dict(done.back) == {}
         assert dict(done.kept) == {"chosen names in use here": 1, "frames of measured nodes": 1}
+        for uuid, channel in ((bytes(10), 0), (B, 0)):
+            two.copy.measurements.rename(uuid, channel, f"name {uuid.hex()}")
+            two.copy.measurements.set_frame(uuid, channel, "elsewhere")
+        assert dict(two.merged(how).back) == {"names": 2, "frames": 2}, "those of others come all the same"
     done = two.merged(how)
     assert (dict(done.back), dict(done.kept)) == ({"names": 1, "frames": 1}, {})
-    assert two.live.measurements.names == {(A, 0): "wrist"}
-    assert two.live.measurements.frames == {(A, 0): "tool0", (B, 1): "tool1"}
+    assert two.live.measurements.names[A, 0] == "wrist"
+    assert (two.live.measurements.frames[A, 0], two.live.measurements.frames[B, 1]) == ("tool0", "tool1")
 
 
 def test_a_frame_that_both_have_is_that_of_a_newer_copy_alone(two: Two) -> None:

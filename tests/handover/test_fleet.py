@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,6 +44,7 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
+from teds_provision.vault.base import Ask
 from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.handover.desk import provisioned, session, trust
@@ -347,12 +349,29 @@ def test_a_station_that_is_not_completed_is_closed(
     assert closed == ["east"]
 
 
+def test_while_a_station_is_made_only_answers_that_are_known_are_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It holds its lock meanwhile: a question ends that, is asked, and all begins again."""
+    answers: list[Any] = []
+
+    def requested(station: Station, _name: object, _keystore: object, known: Ask) -> bytes:
+        answers.append((station._ask is known, known("Passphrase", False)))
+        return b"request"
+
+    monkeypatch.setattr(fleet, "_requested", requested)
+    assert ask_for_certificate(tmp_path / "east", name="east", keystore="file", ask=ask) == b"request"
+    assert answers == [(True, PASSPHRASE)]
+
+
 def test_adopting_again_changes_nothing(tmp_path: Path, owner: Station) -> None:
     home = tmp_path / "east"
     certificate = sign_request(owner, read_request(request(home, "east")))
     for _ in range(2):
         station = adopt_certificate(home, certificate, ask=ask)
         assert (station.ca, station.name) == (owner.ca, "east")
+        (line,) = [entry for entry in station.audit_log.entries() if entry.outcome == "certified"]
+        assert (line.act, line.detail) == ("init", {"ca": fingerprint(owner.ca), "own": True})
         station.close()
 
 
@@ -363,6 +382,8 @@ def test_a_station_with_its_own_ca_joins_for_the_nodes_of_another(tmp_path: Path
     station = adopt_certificate(home, certificate, ask=ask)
     assert station.ca != owner.ca
     assert station.identity.signature_under(owner.ca) == certificate.signature
+    (line,) = [entry for entry in station.audit_log.entries() if entry.outcome == "certified"]
+    assert (line.act, line.detail) == ("init", {"ca": fingerprint(owner.ca), "own": False})
     station.close()
 
 

@@ -105,6 +105,10 @@ def test_a_node_that_comes_back_is_rotated_and_its_tombstone_goes(station: Stati
     assert (station.keys.rotation_due(A) or "").startswith(word)
     assert (station.keys.rotation_due(B) is not None) is (mode == "move")
     assert station.policy.tombstones() == []
+    log = [
+        (entry.uuid, entry.outcome, entry.detail) for entry in station.audit_log.entries() if entry.act == "handover"
+    ]
+    assert log == [(A, "came back", {"handover": "h"})]
 
 
 def test_a_node_gets_a_pin_if_it_has_none_whether_it_is_known_or_not(station: Station) -> None:

@@ -362,3 +362,11 @@ def test_only_origin_and_certificate_have_several_lines(code: int, lines: bool) 
     assert adoption._is_shown("one\ntwo\n", (0, code)) is lines
     assert adoption._is_shown("one two", (0, code))
     assert not adoption._is_shown("one\x1btwo", (0, code))
+
+
+def test_what_is_wrong_with_a_datasheet_is_named_once(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adoption, "_wrong_with", lambda *_: (["one", "one", "two\x1b"], ["same", "same"]))
+    image = Image(bytes(10), dict(load_profile("gripper").build(bytes(10)).blocks))
+    found = read_factory_datasheet(station, image)
+    assert (len(found.errors), found.errors[0], found.warnings) == (2, "one", ("same",))
+    assert "\x1b" not in found.errors[1]

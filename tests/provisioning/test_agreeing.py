@@ -375,3 +375,20 @@ def test_a_new_node_that_stored_the_key_of_a_run_that_was_cut_is_opened_with_it(
             new_key(demanded=demanded)
     else:
         assert new_key(demanded=demanded) == AgreeResult(3, "ab" * 8, fresh=fresh)
+
+
+@pytest.mark.parametrize(
+    ("change", "taken_up"),
+    [({}, True), ({"state": "pending"}, False), ({"unsettled": True}, False), ({"outdated": ["old"]}, False),
+     ({"epoch": 2}, False), ({"epoch": None}, False)],
+)  # fmt: skip
+def test_a_key_is_taken_up_if_nothing_of_before_is_left(
+    station: Station, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], taken_up: bool
+) -> None:
+    how = {"state": "active", "unsettled": False, "outdated": [], "epoch": 3} | change
+    if how["epoch"] is not None:
+        station.nodes.remember(bytes(10), epoch=how["epoch"])
+    monkeypatch.setattr(type(station.pins), "is_unsettled", lambda *_: how["unsettled"])
+    monkeypatch.setattr(type(station.keys), "outdated", lambda *_: how["outdated"])
+    record: Any = SimpleNamespace(uuid=bytes(10), state=how["state"], epoch=3)
+    assert agreeing._is_taken_up(station, record) is taken_up

@@ -595,3 +595,22 @@ def test_what_a_board_is_refused_for_and_what_was_wanted(
     assert refused.value.message == f"Board {uuid.hex()} {text}. Nothing was signed."
     assert refused.value.hint == (f"Install other firmware in the same run: provision {uuid.hex()} --firmware IMAGE")
     assert (refused.value.code, refused.value.exit_code) == ("firmware", 6)
+
+
+@pytest.mark.parametrize(
+    ("state", "changed", "warning"),
+    [
+        ("good", False, ""),
+        ("unjudged", False, ""),
+        ("good", True, "firmware changed since calibration"),
+        ("unjudged", True, "firmware changed since calibration"),
+        ("outdated", False, "its firmware is outdated"),
+        ("bad", True, "its firmware is bad, and firmware changed since calibration"),
+    ],
+)
+def test_a_measurement_is_warned_of_firmware_that_is_not_good_or_has_changed(
+    state: str, changed: bool, warning: str
+) -> None:
+    known: Any = SimpleNamespace(state=state, changed=changed)
+    assert firmware_warning(known) == warning
+    assert firmware_warning(None) == ""

@@ -142,8 +142,19 @@ def test_no_process_to_spare_is_no_reason_to_fail(monkeypatch: pytest.MonkeyPatc
     def none_left() -> int:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
+    lines: list[socket.socket] = []
+    pair = socket.socketpair
+
+    def socketpair() -> tuple[socket.socket, socket.socket]:
+        lines.extend(pair())
+        return lines[-2], lines[-1]
+
     monkeypatch.setattr("os.fork", none_left)
+    monkeypatch.setattr("socket.socketpair", socketpair)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [])
     assert list(map_ranges(len, RANGES, 2)) == [3] * 20
+    assert [line.fileno() for line in lines] == [-1, -1], "nothing stays open"
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == mask
 
 
 @contextmanager

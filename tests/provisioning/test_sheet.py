@@ -588,8 +588,9 @@ def test_on_a_bus_every_row_names_its_board(station: Station, tmp_path: Path, ro
     if good:
         assert len(BatchRun(station, LinkSettings("can"), request, SilentReporter())) == 2
         return
-    with pytest.raises(UsageError, match="rows cannot follow the order of taps"):
+    with pytest.raises(UsageError, match="rows cannot follow the order of taps") as refused:
         BatchRun(station, LinkSettings("can"), request, SilentReporter())
+    assert refused.value.hint == "Give each row its uuid or fingerprint."
 
 
 def test_a_name_is_no_other_nodes_and_a_pattern_may_be_of_many_rows(station: Station, tmp_path: Path) -> None:
