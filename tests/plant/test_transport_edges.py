@@ -715,7 +715,7 @@ def test_an_earlier_request_is_repeated_and_its_answer_used_if_it_is_newer(
     ],
 )
 def test_an_earlier_request_is_one_for_exactly_this_the_newest_by_its_sequence(
-    station: Station, monkeypatch: pytest.MonkeyPatch, rows: list[dict[str, Any]], found: int | None
+    monkeypatch: pytest.MonkeyPatch, rows: list[dict[str, Any]], found: int | None
 ) -> None:
     latest = NOW + timedelta(hours=24)
     usual = {"sequence": 9, "answer": None, "peer": "office", "ahead": -timedelta(days=1), "epoch": 3, "name": "cell",
@@ -729,7 +729,7 @@ def test_an_earlier_request_is_one_for_exactly_this_the_newest_by_its_sequence(
     monkeypatch.setattr(sign_requests, "roster_of", lambda _: None)
     monkeypatch.setattr(sign_requests, "now_of", lambda _: NOW)
     monkeypatch.setattr(sign_requests, "open_request", lambda number, _: requests[number])
-    monkeypatch.setattr(station.plant.line, "sign_requests", lambda *given: asked.append(given) or made)
+    station: Any = stub(plant=stub(line=stub(sign_requests=lambda *given: asked.append(given) or made)), point=b"")
     wanted: Any = stub(job="job", office="office", image=Image(NODE, {(0, 1): b"x", (0, 128): b"of the node"}),
                        epoch=3, name="cell", calibration=b"c", sequence=9)  # fmt: skip
     earlier = sign_requests._earlier(station, wanted)

@@ -375,6 +375,43 @@ def test_who_listens_wakes_the_sync_and_sweeps_each_minute(home: Plant, monkeypa
     assert pauses == [1.0]
 
 
+def test_who_listens_goes_where_the_registry_is_now_and_lets_the_former_place_go(
+    home: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch, _, _ = watching(home.north)
+    log, pauses = list[str](), list[float]()
+    # at the outer look, then after each notification
+    places = iter(["one", "one", "two", "two", "two", "stick", "stick", "stick"])
+
+    def listener(_: Station) -> Any:
+        name = ("one", "two", "", "")[sum(entry.startswith("open") for entry in log)]
+        log.append(f"open {name}")
+
+        def wait(seconds: float) -> bool:
+            log.append(f"wait {name}")
+            return False
+
+        return SimpleNamespace(
+            listen=lambda: log.append(f"listen {name}"), sweep=lambda: None, wait=wait,
+            close=lambda: log.append(f"close {name}"),
+        ) if name else None  # fmt: skip
+
+    def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 2:
+            watch._stop.set()
+
+    monkeypatch.setattr(connecting, "listener", listener)
+    monkeypatch.setattr(connecting, "place_of", lambda _: next(places))
+    monkeypatch.setattr(watch._stop, "wait", pause)
+    watch._listen()
+    assert log == [
+        "open one", "listen one", "wait one", "close one", "open two", "listen two", "wait two", "close two",
+        "open ", "open ",
+    ]  # fmt: skip
+    assert pauses == [60.0, 60.0], "a folder may become a database"
+
+
 def test_a_registry_that_is_out_of_reach_is_listened_to_again_after_a_minute(
     home: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
