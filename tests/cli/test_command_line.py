@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import pytest
@@ -86,7 +87,12 @@ def test_a_run_that_shows_or_that_a_program_reads_has_failed_without_its_output(
     assert (purpose.only_shows, purpose.must_print) == (only_shows, must_print)
 
 
-@pytest.mark.parametrize(("setting", "wants"), [("1", True), ("true", True), ("0", False), ("no", False)])
+@pytest.mark.parametrize(
+    ("setting", "wants"), [
+        ("1", True), ("true", True), ("0", False), ("no", False), ("yes", True), ("ON", True), ("t", True), ("Y", True),
+        ("", False), ("2", False),
+    ],
+)  # fmt: skip
 def test_json_may_be_asked_for_by_variable(monkeypatch: pytest.MonkeyPatch, setting: str, wants: bool) -> None:
     monkeypatch.setenv("TEDS_PROVISION_JSON", setting)
     assert purpose_of(["provision"]).must_print == wants
@@ -114,6 +120,8 @@ LONG = "n" * 200
          f"3 Error: '{LONG[:64]}…' is not a valid file name: File name too long.\n"),
         (OSError(errno.ENAMETOOLONG, "File name too long", LONG[:100]),
          f"3 Error: '{LONG[:100]}' is not a valid file name: File name too long.\n"),
+        (OSError(errno.ENAMETOOLONG, "File name too long"),
+         "1 Error: Unexpected OSError.\n  → This is a bug. Please report it with the output of --debug.\n"),
         (OSError(errno.EPERM, "Operation not permitted"),
          "1 Error: Unexpected PermissionError.\n  → This is a bug. Please report it with the output of --debug.\n"),
         (ValueError("a secret"),
@@ -168,3 +176,68 @@ def test_the_command_that_is_nearest_to_the_one_that_was_typed_is_named(
     code = main.run(["--json", "--home", str(tmp_path), *typed])
     error = json.loads(capsys.readouterr().out)["error"]
     assert (code, error["message"]) == (2, f"{message} (see: teds-provision --help)")
+
+
+@pytest.mark.parametrize(
+    ("columns", "width"),
+    [("1", 50), ("51", 50), ("60", 58), ("100", 98), ("300", 98), ("0", 76), ("-5", 76), ("wide", 76), (None, 76)],
+)
+def test_help_is_as_wide_as_the_terminal_within_bounds(
+    monkeypatch: pytest.MonkeyPatch, columns: str | None, width: int
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setattr(main.os, "get_terminal_size", lambda _descriptor: SimpleNamespace(columns=78))
+    monkeypatch.setattr(main.sys, "__stdout__", SimpleNamespace(fileno=lambda: 1))
+    assert main._help_width() == width
+
+
+@pytest.mark.parametrize("error", [OSError("no terminal"), ValueError("closed"), AttributeError("fileno")])
+def test_help_without_a_terminal_has_80_columns_less_two(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def fileno() -> int:
+        raise error
+
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr(main.sys, "__stdout__", SimpleNamespace(fileno=fileno))
+    assert main._help_width() == 78
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError(), OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize("words", [["--json"], []])
+def test_an_error_that_nobody_can_read_has_its_code_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, words: list[str]
+) -> None:
+    class Full:
+        encoding = "utf-8"
+
+        def write(self, _text: str) -> None:
+            raise error
+
+        def flush(self) -> None: ...
+
+        def isatty(self) -> bool:
+            return False
+
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(main.sys, name, Full())
+    monkeypatch.setattr(App, "current", None)
+    assert main._fail(words, 6, "refused", "It is refused.", "Ask.") == 6
+
+
+def test_options_of_a_command_are_known_under_all_their_names() -> None:
+    @click.group()
+    @click.option("--level", "-l", count=True)
+    @click.option("--prove/--no-prove")
+    @click.option("--name", "-n")
+    def outer() -> None: ...
+
+    @outer.command()
+    @click.option("--file", "-f", type=int)
+    def inner() -> None: ...
+
+    own, valued = main._options(outer, ["x", "inner"])
+    assert own == {"--level", "-l", "--prove", "--no-prove", "--name", "-n", "--file", "-f"}
+    assert valued == {"--name", "-n", "--file", "-f"}
+    assert main._options(outer, ["x"])[1] == {"--name", "-n"}
+    assert main._options(None, ["x"]) == (set(), set())

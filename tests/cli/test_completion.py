@@ -209,3 +209,21 @@ def test_in_a_list_of_zsh_only_what_has_a_description_is_escaped() -> None:
     zsh = shell_completion.Zsh(click.Command("x"), {}, "x", "x")
     assert zsh.format_completion(shell_completion.CompletionItem("a\\b")) == "plain\na\\b\n_"
     assert zsh.format_completion(shell_completion.CompletionItem("a\\b", help="an arm")) == "plain\na\\\\b\nan arm"
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_store_is_closed_after_each_completion(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fails: bool
+) -> None:
+    closed: list[str] = []
+    station = SimpleNamespace(close=lambda: closed.append("closed"))
+    monkeypatch.setattr(shell_completion.stations.Station, "open", lambda *_words, **_how: station)
+    ctx: Any = SimpleNamespace(find_root=lambda: SimpleNamespace(params={"home": tmp_path}))
+
+    def found(_station: Any) -> Any:
+        if fails:
+            raise StoreError("The disk is away.")
+        return [("a", "b")]
+
+    assert len(shell_completion._items(ctx, found)) == (0 if fails else 1)
+    assert closed == ["closed"]

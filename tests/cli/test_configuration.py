@@ -392,6 +392,7 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
             "[sign]\njump = true",
             ["line 2: sign has no option --jump."],
         ),
+        ({"provision": {"help": True}}, "[provision]\nhelp = true", ["line 2: provision has no option --help."]),
         ({"whitelist": {"watch": True}}, "[whitelist]\nwatch = true", ["line 2: whitelist has no option --watch."]),
         ({"whitelist": {"add": {"watch": 1}}}, "[whitelist.add]\nwatch = 1", [
             "line 2: whitelist add has no option --watch."]),
@@ -457,3 +458,10 @@ def test_a_command_reads_the_relative_paths_of_the_file_from_its_folder(tmp_path
     assert context.default_map is not None
     assert context.default_map["trace"] == str(tmp_path / "frames.pcapng")
     assert context.default_map["backup"]["to"] == str(tmp_path / "copy.tpbk")
+
+
+def test_a_link_to_a_file_that_is_gone_is_no_missing_file(home: Path) -> None:
+    """Settings that were meant to apply are not passed over without a word."""
+    (home / "config.toml").symlink_to(home / "gone.toml")
+    refused = call(home, "--json", "nodes")
+    assert (refused.code, refused.json["error"]["message"]) == (8, f"There is no file {home / 'config.toml'}.")

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -47,6 +48,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
         ({}, "Error: It is refused."),
         ({"uuid": "8d4d", "time": "09:00", "row": 3}, "Error (8d4d, 09:00, row 3): It is refused."),
         ({"uuid": "8d4d", "time": None, "row": None}, "Error (8d4d): It is refused."),
+        ({"uuid": "", "row": 0}, "Error (, row 0): It is refused."),
     ],
 )
 def test_an_error_of_one_of_many_names_it_and_its_cure(
@@ -314,3 +316,19 @@ def test_messages_and_questions_are_broken_at_the_edge_of_stderr(
         (sys.stderr, {"spare": len(" [y/N]: ")}),
         (sys.stderr, {"spare": len(" [y/N]: ")}),
     ]
+
+
+def test_a_station_that_a_command_opens_warns_notes_and_is_closed_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[str] = []
+    asked: list[Any] = []
+    station: Any = SimpleNamespace(close=lambda: closed.append("station"))
+    monkeypatch.setattr(context.stations.Station, "open", lambda *words, **how: asked.append((words, how)) or station)
+    app = App(home=tmp_path)
+    assert app.station() is station
+    assert asked == [((tmp_path,), {"ask": app.ask_secret, "notify": app.warn})]
+    assert (station.notice, station.released, station.service_runs) == (app.note, app._released, app._service_runs)
+    assert (station.use_agent, closed) == (True, [])
+    app.close()
+    assert closed == ["station"]

@@ -160,3 +160,31 @@ def test_a_file_that_cannot_be_opened_has_no_kind(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(Path, "open", refuse)
     assert _kind_of(file) is None
     assert _kind_of(Path("a\0b")) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["trust", "ca", "import", "list.xml"], "list.xml is a whitelist."),
+        (["trust", "ca", "sign", "list.xml"], "list.xml is a whitelist."),
+        (["trust", "add", "lab", "angle.csv"], "angle.csv is a calibration (CSV)."),
+        (["whitelist", "import", "list.xml"], ""),
+        (["build", "8d4d", "-p", "list.xml"], "list.xml is a whitelist."),
+        (["build", "8d4d", "--profile=list.xml"], "list.xml is a whitelist."),
+        (["build", "8d4d", "-p", "gripper.toml"], ""),
+        (["build", "8d4d", "--calibration", "2=list.xml"], "list.xml is a whitelist."),
+        (["node", "run", "a", "--source", "dbc:list.xml"], "list.xml is a whitelist."),
+        (["node", "run", "a", "--source", "dbc:bus.dbc"], ""),
+        (["nodes", "list.xml"], ""),
+    ],
+)
+def test_which_file_of_a_command_line_is_not_taken_there(folder: Path, words: list[str], found: str) -> None:
+    del folder
+    assert mistaken_file(words) == found
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff", "\ufeff \r\n", " \ufeff"])
+def test_a_mark_before_the_text_hides_no_kind(tmp_path: Path, mark: str) -> None:
+    file = tmp_path / "file"
+    file.write_text(f"{mark}<whitelist/>", encoding="utf-8")
+    assert _kind_of(file) == "a whitelist"

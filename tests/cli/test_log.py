@@ -316,3 +316,15 @@ def test_a_command_whose_trace_is_incomplete_is_7_if_all_else_went_well(
         traced("both", fails=True, error=LinkError("The node is silent."))
     with tracing(None) as none:
         assert none is None
+
+
+def test_a_trace_without_a_frame_is_removed_also_after_ctrl_c(tmp_path: Path) -> None:
+    """The same command can be typed again."""
+    for number, error in enumerate((KeyboardInterrupt(), LinkError("It is silent."), SystemExit(1))):
+        path = tmp_path / f"{number}.trace"
+        with pytest.raises(type(error)), tracing(path):
+            raise error
+        assert not path.exists()
+    with tracing(tmp_path / "whole"):
+        pass
+    assert (tmp_path / "whole").exists(), "who recorded nothing and ended well has an empty trace"

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from teds_provision import firmware_image, provisioning
 from teds_provision.cli.context import App
-from teds_provision.cli.node.at_node import PressLines
+from teds_provision.cli.node.at_node import PressLines, _locate_each
 from teds_provision.cli.node.update import _ProgressTable
 from teds_provision.errors import (
     BoardLostError,
@@ -599,3 +599,44 @@ def test_who_watches_has_a_line_for_each_press_and_all_else_is_progress_as_befor
     [(result, text)] = course
     assert result.pop("time").endswith("Z")
     assert (result, text) == ({"uuid": NODE, "pressed": True}, f"{NODE}  says it was pressed")
+
+
+@pytest.mark.parametrize(
+    ("add", "listed", "steps"), [(True, False, ["whitelist"]), (True, True, []), (False, False, []), (False, True, [])]
+)
+def test_a_plan_adds_a_node_that_is_not_listed(
+    home: Path, stand_in: Any, add: bool, listed: bool, steps: list[str]
+) -> None:
+    stand_in(provisioning.identify, "identify_at", [arrival(proven(whitelisted=listed))])
+    words = ("identify", *(["--add"] if add else []), "--dry-run", *NFC)
+    assert call(home, "--json", *words).json["plan"] == steps
+    text = "would be whitelisted" if steps else "whitelisted" if listed else "not whitelisted"
+    assert f"  factory  {text}  thumb" in call(home, *words).out
+
+
+def test_boards_that_were_located_are_listed_with_their_names(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def locate(_station: Any, _links: Any, uuids: list[str], seconds: int, _reporter: Any, *, ask_name: Any) -> Any:
+        asked.append((uuids, seconds, ask_name(OTHER, "old")))
+        return [LocatedNode(UUID, "thumb"), (OTHER, NoNodeError("No node answered.")), LocatedNode(THIRD, None)]
+
+    monkeypatch.setattr(provisioning.locate, "locate_at", locate)
+    course: list[Any] = []
+    app: Any = SimpleNamespace(
+        station=lambda: None,
+        ask_text=lambda question, default: course.append((question, default)) or "new",
+        fail_line=lambda error, *, uuid: course.append((error.message, uuid)),
+        emit=lambda result, text: course.append((result, text)),
+    )
+    boards = [{"uuid": uuid.hex()} for uuid in (UUID, OTHER, THIRD)]
+    _locate_each(app, None, boards, None)  # type: ignore[arg-type]
+    assert asked == [([NODE, OTHER.hex(), THIRD.hex()], 60, "new")]
+    assert course == [
+        (f"Board 2 of 3 ({OTHER.hex()}) blinks. Its name", "old"),
+        ("No node answered.", OTHER.hex()),
+        (
+            {"located": [{"uuid": NODE, "name": "thumb"}, {"uuid": THIRD.hex(), "name": None}]},
+            f"{NODE}  thumb\n{THIRD.hex()}  (no name)",
+        ),
+    ]

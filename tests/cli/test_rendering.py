@@ -314,3 +314,26 @@ def test_of_a_long_list_the_first_lines_and_how_many_more_there_are(count: int, 
 @pytest.mark.parametrize("value", [math.inf, -math.inf])
 def test_a_value_that_is_no_number_is_shown_as_it_is(value: float) -> None:
     assert tidy(value, 0.5) == value
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "shown"),
+    [
+        (math.nan, 0.5, "nan"), (math.nan, None, "nan"), (1.23456, math.nan, "1.23456"), (1.23456, math.inf, "1.23456"),
+        (1.23456, 0.0, "1.23456"), (1.23456, -1.0, "1.23456"), (-1e-9, 0.5, "0.0"), (-1e-9, None, "-1e-09"),
+    ],
+)  # fmt: skip
+def test_a_value_with_a_strange_uncertainty_is_shown_as_it_is(
+    value: float, uncertainty: float | None, shown: str
+) -> None:
+    assert repr(tidy(value, uncertainty)) == shown
+
+
+def test_a_wait_that_is_over_has_no_seconds_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    live: Any = rendering.LiveReporter.__new__(rendering.LiveReporter)
+    live._step, live._what, live._until = "agree", "Tap it", 101.4
+    monkeypatch.setattr(rendering, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    assert str(live._render().text) == "agree  Tap it (1 s left)"
+    now[0] = 103.0
+    assert str(live._render().text) == "agree  Tap it (0 s left)"

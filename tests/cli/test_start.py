@@ -275,3 +275,28 @@ def test_a_service_that_ends_meanwhile_is_none(station: Station, error: Exceptio
     assert start._of_service(app, station) is None
     app.running_service = lambda timeout: None
     assert start._of_service(app, station) is None
+
+
+def test_on_the_first_screen_is_what_waits_for_a_person_and_nothing_that_is_good(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    findings = [
+        Finding("nodes", "warning", "3 nodes wait.", "Do it."),
+        Finding("nodes", "ok", "The others are good.", "x"),
+        Finding("nodes", "skipped", "Not looked at.", "y"),
+    ]
+    found = {
+        "station": {"name": "bench", "fingerprint": "ab" * 32},
+        "links": [],
+        "nodes": [],
+        "problems": [],
+        "known": 3,
+    }
+    monkeypatch.setattr(start, "_of_service", lambda *_words: dict(found, problems=[]))
+    monkeypatch.setattr(start.fleet, "nodes", lambda _system: findings)
+    assert call(home, "--json").json["problems"] == [{"what": "3 nodes wait.", "fix": "Do it."}]
+
+
+def test_a_link_that_is_down_comes_before_one_that_is_silent() -> None:
+    links = [link("can:silent"), link("can:down", state="down")]
+    assert start._next({"links": links, "nodes": []}) == "teds-provision doctor --can down"

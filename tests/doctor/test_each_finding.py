@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
 import sqlite3
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision.doctor import fleet, links, machine
+from teds_provision.doctor import fleet, links, machine, station
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code, intact
 from teds_provision.errors import (
     KeyringUnavailableError,
     LinkError,
     NoReaderError,
+    NotFoundError,
     StoreChangedError,
     StoreError,
     VaultError,
@@ -724,3 +727,156 @@ def test_nobody_is_asked_for_a_passphrase() -> None:
     with pytest.raises(VaultError) as error:
         fleet._nobody("Passphrase")
     assert error.value.message == "doctor never asks for a passphrase."
+
+
+# -- what is odd about a machine and a station -------------------------------------------------------------------------
+
+
+def test_a_config_that_cannot_be_read_keeps_the_remedy_of_its_error(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system.home.mkdir()
+    path = system.home / "config.toml"
+    path.write_bytes(b"a = '\xff'\n")
+    assert words(system, "config") == [("failed", f"{path}:1: the text is not UTF-8.", "Save the file as UTF-8.")]
+    path.write_text("a = [")
+    [(result, _, fix)] = words(system, "config")
+    assert (result, fix) == ("failed", "Fix or remove the file.")
+
+
+@pytest.mark.parametrize(("count", "shown", "more"), [(1, 1, ""), (5, 5, ""), (6, 5, " …")])
+def test_of_nodes_that_wait_five_are_named(
+    stationed: System, monkeypatch: pytest.MonkeyPatch, count: int, shown: int, more: str
+) -> None:
+    uuids = [bytes([number]) * 10 for number in range(count)]
+    monkeypatch.setattr(fleet, "_firmware", lambda _station, _sample: (uuids, []))
+    found = next(finding for finding in words(stationed, "nodes") if "firmware" in finding[1])
+    some = ", ".join(uuid.hex() for uuid in uuids[:shown])
+    assert found == (
+        "warning",
+        f"{count} with firmware that their type does not accept: {some}{more}.",
+        "teds-provision update UUID IMAGE",
+    )
+
+
+@pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (120, "ok"), (121, "failed")])
+def test_a_clock_may_be_two_minutes_before_the_last_entry(
+    system: System, monkeypatch: pytest.MonkeyPatch, ahead: int, result: str
+) -> None:
+    now = machine.datetime(2026, 11, 22, 12, 0, tzinfo=machine.UTC)
+    last = now + timedelta(seconds=ahead)
+    monkeypatch.setattr(machine, "datetime", SimpleNamespace(now=lambda _: now))
+    monkeypatch.setattr(machine, "_last_entry", lambda _system: last)
+    assert one(machine.clock(system)).result == result
+
+
+def test_a_time_of_the_log_or_of_the_hardware_that_is_none_is_not_compared(
+    stationed: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Station.inspect
+
+    @contextmanager
+    def inspect(home: Path) -> Iterator[Any]:
+        with real(home):
+            yield SimpleNamespace(audit_log=SimpleNamespace(latest=lambda: "yesterday"))
+
+    monkeypatch.setattr(Station, "inspect", inspect)
+    assert machine._last_entry(stationed) is None
+    clock = stationed.at("/sys/class/rtc/rtc0/since_epoch")
+    clock.parent.mkdir(parents=True)
+    clock.write_text("never\n")
+    assert machine._drift(stationed) is None
+
+
+def test_half_a_number_of_a_reader_is_one_that_is_being_plugged_in(system: System) -> None:
+    vendor, product = next(iter(links.READERS))
+    usb(system)
+    (system.at("/sys/bus/usb/devices") / "1-2" / "devnum").write_text("\n")
+    found = next(links.readers(system))
+    assert (found.result, found.fix) == ("warning", "Run doctor again."), (vendor, product)
+
+
+def test_a_port_that_can_be_read_but_not_written_is_closed(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = system.at("/dev/ttyACM0")
+    port.parent.mkdir(parents=True)
+    port.touch()
+    monkeypatch.setattr(os, "access", lambda _path, how: how == os.R_OK)
+    assert one(links.serial_ports(system)).why == "You do not have permission to open ttyACM0."
+
+
+def test_a_process_that_ends_while_pcscd_is_looked_for_is_passed_over(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, name in ((1, "gone"), (2, "pcscd")):
+        comm = system.at(f"/proc/{number}/comm")
+        comm.parent.mkdir(parents=True)
+        comm.write_text(f"{name}\n")
+    read = Path.read_text
+
+    def gone(path: Path, *words: Any, **how: Any) -> str:
+        if path.parent.name == "1":
+            raise ProcessLookupError
+        return read(path, *words, **how)
+
+    monkeypatch.setattr(Path, "read_text", gone)
+    assert [finding.result for finding in links._pcscd(system, False)] == ["ok"]
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_full_check_looks_at_every_row(stationed: System, monkeypatch: pytest.MonkeyPatch, full: bool) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(Station, "damage", lambda _station, sample: asked.append(sample) or "torn")
+    assert words(replace(stationed, full=full), "store") == [
+        ("failed", "The store is damaged: torn.", "teds-provision restore FILE")
+    ]
+    assert [sample is None for sample in asked] == [full]
+
+
+def test_a_station_without_nodes_needs_no_backup_yet(stationed: System) -> None:
+    assert ("ok", "Nothing to back up yet.", "") in words(stationed, "store")
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_the_log_of_the_keyrings_is_as_it_was(before: bool) -> None:
+    logger = logging.getLogger("keyring")
+    was, logger.disabled = logger.disabled, before
+    try:
+        with station._quiet_logging():
+            assert logger.disabled
+        assert logger.disabled is before
+    finally:
+        logger.disabled = was
+
+
+@pytest.mark.parametrize(
+    ("content", "result"),
+    [
+        ({"memory_kib": 19 * 1024}, "The passphrase file exists (Argon2id, 19 MiB)."),
+        ({"memory_kib": 19 * 1024 - 1}, "The passphrase file has weak demo settings."),
+        ({"memory_kib": "much"}, "The passphrase file has weak demo settings."),
+        ({"memory_kib": 19 * 1024, "store": None}, None),
+        ({"memory_kib": 19 * 1024, "store": "another"}, None),
+    ],
+)
+def test_a_passphrase_file_is_of_this_store_and_costs_a_guesser_much(
+    stationed: System, monkeypatch: pytest.MonkeyPatch, content: dict[str, Any], result: str | None
+) -> None:
+    with Station.inspect(stationed.home) as opened:
+        own = opened.id
+    monkeypatch.setattr(station, "read_sealed", lambda _path: {"store": own} | content)
+    if result is not None:
+        assert station._file_vault(stationed).why == result
+        return
+    with pytest.raises(VaultError, match=r"^vault\.json belongs to another store\.$"):
+        station._file_vault(stationed)
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), NotFoundError("It is gone.")])
+def test_a_file_of_keys_that_cannot_be_read_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def refuse(_path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr(station, "open_to_read", refuse)
+    assert station.holds_private_key(tmp_path / "a.pem") is False

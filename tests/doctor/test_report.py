@@ -184,3 +184,9 @@ def test_a_store_that_cannot_be_read_has_no_last_errors(tmp_path: Path) -> None:
     (tmp_path / "home" / "store.sqlite3").write_bytes(b"no database, but as long as a page" * 200)
     system = System(tmp_path / "home", workspace=tmp_path, root=tmp_path, environment={})
     assert report._last_errors(system, Mask(system, with_uuids=True)) == []
+
+
+def test_a_user_of_one_letter_hides_no_other_letters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(getpass, "getuser", lambda: "a")
+    monkeypatch.setattr(socket, "gethostname", lambda: "")
+    assert Mask(System(tmp_path), with_uuids=False)("a node, in a group") == "a node, in a group"
