@@ -210,6 +210,33 @@ def test_keys_of_a_removed_stations_pages_that_do_not_count_are_known_as_held(mo
     }  # fmt: skip
 
 
+def test_keys_are_reviewed_when_another_station_is_removed_and_each_hour(
+    opened: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hour, reviews = timedelta(hours=1), list[datetime]()
+    monkeypatch.setattr(removed_members, "_first_removals", lambda _station, now: reviews.append(now) or {})
+    for name, value in (("_beyond", {}), ("_pages", ()), ("_alone", 3)):
+        monkeypatch.setattr(removed_members, name, lambda *_, value=value: value)
+
+    def review(now: datetime, *removed: str) -> removed_members.RemovalReview | None:
+        reviews.clear()
+        roster: Any = stub(removed=[stub(fingerprint=digits) for digits in removed])
+        return removed_members.review(opened, roster, now)
+
+    assert (review(NOW), reviews) == (None, [])
+    first = review(NOW, WEST, SOUTH)
+    assert first is not None
+    assert (first.at, first.alone, reviews) == (NOW.isoformat(), 3, [NOW])
+    for removed in ((WEST, SOUTH), (SOUTH, WEST)):
+        for now in (NOW + hour - SECOND, NOW - hour + SECOND):
+            assert (review(now, *removed), reviews) == (first, []), "it is the same, in whatever order"
+    for now in (NOW + hour, NOW - hour):
+        assert review(now, WEST, SOUTH) != first, "by a clock that was wrong then, too"
+        assert review(NOW, WEST, SOUTH) == first
+    assert review(NOW, WEST) != first
+    assert removed_members.last(opened) == review(NOW, WEST)
+
+
 def test_an_alarm_and_a_roster_are_entries_with_whom_they_are_about(opened: Station, log: Log) -> None:
     for again, why in ((False, "first"), (False, "it lasts"), (True, "once more")):
         apply_pages.alarm(opened, "junk", WEST, 3, why, again=again)

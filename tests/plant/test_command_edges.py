@@ -321,6 +321,55 @@ def test_a_plan_of_an_export_writes_no_evidence(home: Path, tmp_path: Path, monk
     assert written == [False, True, True, False]
 
 
+def test_what_a_station_will_publish_is_counted_by_act_or_is_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plant.backlog, "count", lambda past: dict.fromkeys(past, len(past)))
+    says = "  it will publish what this store knows: "
+    assert commands._past(["signed", "agreed"]) == f"{says}2 agreed, 2 signed"
+    assert commands._past([]) == f"{says}nothing"
+
+
+def test_a_folder_is_the_one_that_was_joined_by_whatever_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "stick").mkdir()
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    joined = [SimpleNamespace(where=str((tmp_path / "stick").resolve()))]
+    monkeypatch.setattr(plant.connecting, "open_transport", lambda _: joined[0])
+    station = cast("Any", None)
+    for path, connected in (("stick", True), ("other/../stick", True), (tmp_path / "stick", True), ("other", False)):
+        transport, same = commands._transport(station, Path(path))
+        assert (transport.where, same) == (str(Path(path)), connected)
+    assert commands._transport(station, None) == (joined[0], True)
+    joined[0] = cast("Any", None)
+    assert commands._transport(station, Path("stick"))[1] is False
+
+
+def test_an_office_that_is_silent_is_an_error_unless_its_request_went_into_a_file(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders = list[Any]()
+    image = SimpleNamespace(uuid=bytes.fromhex(NODE))
+    silent = [True]
+
+    def sign_by_office(_station: Station, _links: object, order: Any, _reporter: object) -> Any:
+        orders.append(order)
+        if silent[0]:
+            raise plant.sign_requests.OfficeSilentError("It has not answered yet.", hint="The request is kept.")
+        return SimpleNamespace(image=image, sequence=7, reused=True)
+
+    monkeypatch.setattr(plant.sign_requests, "sign_by_office", sign_by_office)
+    request = tmp_path / "a.request"
+    words = ("sign", NODE, "--by", "office", "--job", "0b5f")
+    refused(call(home, *words), 5, "It has not answered yet.", "The request is kept.")
+    assert call(home, *words, "--output", request).out == f"Wrote the request to {request}. The request is kept.\n"
+    assert call(home, "--json", *words, "--output", request).json == {"request": str(request)}
+    assert [(order.node, order.by, order.job, order.output) for order in orders] == [
+        (NODE, "office", "0b5f", None), *[(NODE, "office", "0b5f", request)] * 2
+    ]  # fmt: skip
+    silent[0] = False
+    assert call(home, *words).out == (f"office signed {NODE}, sequence 7. Write it: teds-provision write {NODE}\n")
+    assert call(home, "--json", *words).json == {"uuid": NODE, "sequence": 7, "signed_by": "office", "reused": True}
+
+
 def test_who_resumes_is_warned_of_a_copy_and_asked(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     resumed = list[bool]()
     monkeypatch.setattr(plant.sync, "resume", lambda *_: resumed.append(True) or 2)

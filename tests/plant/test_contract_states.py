@@ -208,7 +208,12 @@ def test_each_station_has_its_state_and_age(station: Station, monkeypatch: pytes
     station.plant.pages.put_chain(replace(newer, waits="it is of a newer version"))
     record = station.plant.joined
     assert record is not None
+    conflicts = [(bytes(10), "two keys", "a and b"), (bytes(10), "name", "c"), (b"\1" * 10, "name", "d")]
+    with monkeypatch.context() as patch:
+        patch.setattr(station.plant.claims, "conflicts", lambda: iter(conflicts))
+        assert status.status(station, record, now).conflicts == 2, "nodes are counted, not their conflicts"
     found = status.status(station, record, now)
+    assert found.conflicts == 0
     assert [(one.name, one.number, one.age, one.state) for one in found.standings] == [
         ("owner", 3, 9, "here"),
         ("old", 5, week + 1, "silent"),

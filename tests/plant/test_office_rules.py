@@ -397,6 +397,41 @@ def test_what_the_pins_or_the_guard_refuse_is_answered_with_their_reason(
     assert desk.asks(request).refused == "", "neither is remembered"
 
 
+def test_an_office_names_what_it_would_build_differently_up_to_five_places(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = desk.request(desk.run(), make_board(1))
+    own = request.image.unsigned_blocks()
+    extra = {(channel, code): b"added" for channel in (3, 2) for code in (9, 7, 8)}
+    job = SimpleNamespace(read_only=(), name=None, profile="p")
+    monkeypatch.setattr(
+        office, "_profile", lambda *_: SimpleNamespace(build=lambda *_, **__: SimpleNamespace(blocks=own))
+    )
+    monkeypatch.setattr(office, "_calibrations", lambda *_: {})
+    monkeypatch.setattr(office, "guard", lambda *_, **__: None)
+    places = ["TEDS 7 of channel 2", "TEDS 8 of channel 2", "TEDS 9 of channel 2", "TEDS 7 of channel 3",
+              "TEDS 8 of channel 3"]  # fmt: skip
+
+    def built(blocks: dict[Any, bytes], *read_only: Any) -> Any:
+        job.read_only = read_only
+        image = SimpleNamespace(unsigned_blocks=lambda: blocks)
+        asked: Any = SimpleNamespace(uuid=request.uuid, name=None, image=image)
+        return office._built(desk.office, cast("Any", job), asked)
+
+    with pytest.raises(_RefusedError) as error:
+        built(own | extra)
+    assert (error.value.word, error.value.why) == (
+        "differs", f"this office would build it differently: {', '.join(places)}"
+    )  # fmt: skip
+    assert built(own).blocks == own
+    assert built(own | extra, *extra).blocks == own | extra, "what the job lists is read-only in the node"
+    with pytest.raises(_RefusedError, match=r"differently: TEDS 9 of channel 3$"):
+        built(own | extra, *sorted(extra)[:5])
+    lacking = dict(list(own.items())[1:])
+    with pytest.raises(_RefusedError, match="would build it differently: TEDS "):
+        built(lacking)
+
+
 def test_an_office_answers_in_turn_and_takes_away_what_it_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     """A request from the future stays, one of a removed station gets no answer, a foreign one is discarded."""
     notices, sent, gone = list[str](), list[tuple[str, bytes, str]](), list[str]()

@@ -972,6 +972,22 @@ def test_a_database_needs_its_driver_and_a_schema_that_is_known(monkeypatch: pyt
     )  # fmt: skip
     rows[0] = ("meta", None, 2, REGISTRY)
     assert registry.look().registry == REGISTRY
+    asked = list[str]()
+
+    def rows_of(version: int) -> Callable[..., list[Any]]:
+        def ask(statement: str, _values: object) -> list[Any]:
+            asked.append(statement)
+            if statement == postgres._LOOK:
+                raise postgres._NoSchemaError("There is no table.")
+            return [("meta", None, version, REGISTRY)]
+
+        return ask
+
+    for version, statements in ((1, [postgres._LOOK_1]), (2, [])):
+        asked.clear()
+        monkeypatch.setattr(registry, "_rows", rows_of(version))
+        assert registry.look().schema == version
+        assert asked[2:] == statements, "only of an older schema less is asked"
 
 
 # -- parcels -----------------------------------------------------------------------------------------------------------

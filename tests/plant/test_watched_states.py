@@ -130,6 +130,21 @@ def test_the_whole_answer_about_the_plant(home: Plant, monkeypatch: pytest.Monke
     }
 
 
+def test_a_sync_that_a_wrong_clock_dated_ahead_has_no_negative_age(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = station.plant.joined
+    assert record is not None
+    station.plant.put_record(replace(record, synced=EARLY))
+    watch, _, _ = watching(station)
+    synced = datetime.fromisoformat(EARLY).timestamp()
+    for now, age in ((synced + 2.5, 2.5), (synced, 0.0), (synced - 9, 0.0)):
+        monkeypatch.setattr("teds_provision.plant.service.time", SimpleNamespace(time=lambda now=now: now))
+        shown = watch.status()
+        assert shown is not None
+        assert (shown["synced"], shown["age"]) == (synced, age)
+
+
 def test_before_the_first_sync_there_is_no_age(station: Station) -> None:
     watch, _, _ = watching(station)
     found = watch.status()

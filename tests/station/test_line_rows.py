@@ -124,3 +124,16 @@ def test_requests_to_an_office_are_kept_by_direction_and_in_the_order_of_their_s
     signed = replace(asked, answer=b"signed", sequence=8)
     line.put_sign_request(signed)
     assert line.sign_requests("job-1", A, "out") == [twin, first, later, signed]
+
+
+def test_every_request_is_given_once_however_many_there_are(station: Station) -> None:
+    line = station.plant.line
+    assert list(line.all_sign_requests()) == []
+    rows = [
+        SignRequestRow(f"{number:02x}" * 32, "out" if number % 2 else "in", "job", A, "office", b"request", at=FIRST)
+        for number in range(40)
+    ]  # fmt: skip
+    with station.transaction():
+        for row in reversed(rows):
+            line.put_sign_request(row)
+    assert list(line.all_sign_requests()) == rows

@@ -42,6 +42,10 @@ def test_with_a_group_go_its_measurements(station: Station) -> None:
     station.measurements.keep(KeptMeasurement("m2", uuids=(ONE, TWO), kind="event", trigger=True))
     assert station.measurements.get("m1") == wanted
     assert [measurement.id for measurement in station.measurements.all()] == ["m1", "m2"]
+    assert station.measurements.forget("m3") is False
+    assert station.measurements.forget("m2") is True
+    assert station.measurements.forget("m2") is False
+    station.measurements.keep(KeptMeasurement("m2", uuids=(ONE, TWO), kind="event", trigger=True))
     assert station.groups.delete("hand")
     assert [measurement.id for measurement in station.measurements.all()] == ["m2"]
     assert not station.groups.delete("hand")
