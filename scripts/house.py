@@ -11,10 +11,10 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeGuard
+from typing import TypeGuard, cast
 
 PACKAGE = Path(__file__).resolve().parent.parent / "teds_provision"
 NAME = "teds_provision"
@@ -22,35 +22,40 @@ NAME = "teds_provision"
 
 @dataclass(frozen=True)
 class Module:
-    """One file: its dotted name, its tree, and the dotted names of ours that it imports, anywhere in it."""
+    """One file: its dotted name, its nodes, and the dotted names of ours that it imports, anywhere in it."""
 
     name: str
     path: Path
-    tree: ast.Module
+    nodes: Sequence[ast.AST]  # as ast.walk finds them: the first is the tree
     imports: frozenset[str]
 
+    @property
+    def tree(self) -> ast.Module:
+        """Its syntax tree."""
+        return cast("ast.Module", self.nodes[0])
 
-def parsed(path: Path) -> ast.Module:
-    """Return the tree of a file."""
-    return ast.parse(path.read_text(encoding="utf-8"))
+
+def walked(path: Path) -> Sequence[ast.AST]:
+    """Return the nodes of a file."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
-def modules(parse: Callable[[Path], ast.Module] = parsed) -> dict[str, Module]:
-    """Return every module of the package by its dotted name; ``parse`` may keep the trees."""
-    found: dict[str, tuple[Path, ast.Module]] = {}
+def modules(walk: Callable[[Path], Sequence[ast.AST]] = walked) -> dict[str, Module]:
+    """Return every module of the package by its dotted name; ``walk`` may keep the nodes."""
+    found: dict[str, tuple[Path, Sequence[ast.AST]]] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        found[name] = path, parse(path)
+        found[name] = path, walk(path)
     return {
-        name: Module(name, path, tree, frozenset(_targets(tree, set(found)) - {name}))
-        for name, (path, tree) in found.items()
+        name: Module(name, path, nodes, frozenset(_targets(nodes, set(found)) - {name}))
+        for name, (path, nodes) in found.items()
     }
 
 
-def _targets(tree: ast.AST, known: set[str]) -> set[str]:
+def _targets(nodes: Iterable[ast.AST], known: set[str]) -> set[str]:
     result: set[str] = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             result |= {alias.name for alias in node.names if alias.name in known}
         elif isinstance(node, ast.ImportFrom) and node.module in known:
@@ -134,8 +139,14 @@ def late_imports(found: dict[str, Module]) -> list[str]:
     """Return imports of our own modules inside functions: ``file:line``."""
     result = set()
     for module in found.values():
-        functions = (node for node in ast.walk(module.tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
-        late = (node for function in functions for node in ast.walk(function) if _imports_ours(node))
+        ours = [node for node in module.nodes if _imports_ours(node)]
+        lines = {
+            line
+            for node in (module.nodes if ours else ())
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            for line in range(node.body[0].lineno, (node.end_lineno or 0) + 1)
+        }
+        late = (node for node in ours if node.lineno in lines)
         result |= {f"{module.path.relative_to(PACKAGE)}:{node.lineno}" for node in late}
     return sorted(result)
 
@@ -170,9 +181,7 @@ def drawers() -> list[tuple[int, str]]:
 def functions(found: dict[str, Module]) -> int:
     """Return the number of functions and methods, those inside others included."""
     return sum(
-        isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        for module in found.values()
-        for node in ast.walk(module.tree)
+        isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) for module in found.values() for node in module.nodes
     )
 
 
@@ -184,8 +193,8 @@ def used_once(found: dict[str, Module]) -> list[str]:
     result = []
     for module in found.values():
         text = module.path.read_text(encoding="utf-8")
-        called = Counter(_called(node) for node in ast.walk(module.tree) if isinstance(node, ast.Call))
-        for node in ast.walk(module.tree):
+        called = Counter(_called(node) for node in module.nodes if isinstance(node, ast.Call))
+        for node in module.nodes:
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
             first = min([node.lineno, *(expression.lineno for expression in node.decorator_list)])

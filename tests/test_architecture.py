@@ -7,14 +7,14 @@ import importlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from teds_provision.optional_rooms import OPTIONAL, Hook, load, rooms
-from tests.parsed import parsed
+from tests.parsed import parsed, walked
 
 PACKAGE = Path(__file__).parent.parent / "teds_provision"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -91,9 +91,9 @@ def room_of(path: Path) -> str:
     return parts[0] if len(parts) > 1 else path.stem
 
 
-def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """Yield every module that is imported anywhere in a tree, with its line; `from x import y` counts as x.y too."""
-    for node in ast.walk(tree):
+def imports(nodes: Iterable[ast.AST]) -> Iterator[tuple[str, int]]:
+    """Yield every module that is imported by one of the nodes, with its line; `from x import y` counts as x.y too."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -104,7 +104,7 @@ def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
 @cache
 def imports_of(path: Path) -> list[tuple[str, int]]:
     """Return what a module of the package imports; five rules ask."""
-    return list(imports(parsed(path)))
+    return list(imports(walked(path)))
 
 
 def may_import(room: str) -> set[str]:
@@ -124,7 +124,7 @@ def test_arrows_between_rooms_point_one_way() -> None:
 
 
 def test_importing_the_package_imports_none_of_its_rooms() -> None:
-    assert not [name for name, _ in imports(parsed(PACKAGE / "__init__.py")) if name.startswith("teds_provision")]
+    assert not [name for name, _ in imports(walked(PACKAGE / "__init__.py")) if name.startswith("teds_provision")]
 
 
 def file_of(name: str) -> Path | None:
@@ -266,7 +266,7 @@ def test_nothing_above_the_station_gets_its_tables() -> None:
     reached = [
         f"{name_of(path)}:{node.lineno} {ast.unparse(node)}"
         for path in above
-        for node in ast.walk(parsed(path))
+        for node in walked(path)
         if isinstance(node, ast.Attribute) and _is_the_file(node)
     ]
     assert not imported + reached
@@ -278,7 +278,7 @@ def test_each_table_is_written_by_one_topic() -> None:
     for path in MODULES:
         if room_of(path) != "station" or "/store/" in f"/{name_of(path)}" or path.stem == "snapshot":
             continue
-        for node in ast.walk(parsed(path)):
+        for node in walked(path):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 unnamed = re.search(r"\b(?:INTO|UPDATE|DELETE FROM) $", node.value)  # of an f-string: any table
                 assert unnamed is None, f"{name_of(path)}:{node.lineno} names no table"
@@ -296,23 +296,23 @@ _LINK_FOLDERS = tuple(sorted(path.name for path in (PACKAGE / "links").iterdir()
 @cache
 def classes_of_links() -> frozenset[str]:
     """Return names of the classes in the folder of each link: CanPort, BleLink …."""
-    trees = [parsed(path) for name in _LINK_FOLDERS for path in (PACKAGE / "links" / name).rglob("*.py")]
-    named = (node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    files = [path for name in _LINK_FOLDERS for path in (PACKAGE / "links" / name).rglob("*.py")]
+    named = (node.name for path in files for node in walked(path) if isinstance(node, ast.ClassDef))
     return frozenset(name for name in named if name.lower().startswith(_LINK_FOLDERS))
 
 
-def places_that_know_a_link(tree: ast.AST) -> Iterator[tuple[int, str]]:
+def places_that_know_a_link(nodes: Sequence[ast.AST]) -> Iterator[tuple[int, str]]:
     """Yield each place that distinguishes links: an import from its folder, its class, or its name."""
     names = {f"{name}{end}" for name in _LINK_FOLDERS for end in ("", ":")}
 
     def is_named(part: ast.AST) -> bool:
         return any(isinstance(node, ast.Constant) and node.value in names for node in ast.walk(part))
 
-    for name, line in imports(tree):
+    for name, line in imports(nodes):
         parts = name.split(".")
         if parts[:2] == ["teds_provision", "links"] and len(parts) > 2 and parts[2] in _LINK_FOLDERS:
             yield line, f"imports {name}"
-    for node in ast.walk(tree):
+    for node in nodes:
         match node:
             case ast.Compare() if is_named(node):
                 yield node.lineno, f"compares {ast.unparse(node)}"
@@ -331,7 +331,7 @@ def test_measure_and_ncap_know_a_link_by_its_capabilities_alone() -> None:
         f"{name_of(path)}:{line} {what}"
         for path in MODULES
         if room_of(path) in _KNOWS_NO_LINK
-        for line, what in places_that_know_a_link(parsed(path))
+        for line, what in places_that_know_a_link(walked(path))
     ]
     assert not wrong
 
@@ -350,7 +350,7 @@ def test_measure_and_ncap_know_a_link_by_its_capabilities_alone() -> None:
     ],
 )
 def test_each_way_to_know_a_link_is_seen(code: str) -> None:
-    assert list(places_that_know_a_link(ast.parse(code)))
+    assert list(places_that_know_a_link([*ast.walk(ast.parse(code))]))
 
 
 def test_no_room_of_the_core_imports_an_optional_room() -> None:
@@ -366,7 +366,7 @@ def test_no_room_of_the_core_imports_an_optional_room() -> None:
     late = [
         f"{name_of(path)}:{node.lineno} names {node.value}"
         for path in core
-        for node in ast.walk(parsed(path))
+        for node in walked(path)
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and dotted.match(node.value)
     ]
     assert not imported + late
@@ -386,7 +386,7 @@ def test_what_a_room_registers_is_there_and_asked_for() -> None:
         node.args[0].value
         for path in MODULES
         if room_of(path) not in OPTIONAL
-        for node in ast.walk(parsed(path))
+        for node in walked(path)
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == Hook.__name__
         if isinstance(node.args[0], ast.Constant)
     }

@@ -11,7 +11,7 @@ import teds_provision
 from teds_provision import errors
 from teds_provision.client import ApiError
 from teds_provision.errors import EXIT_CODES, LinkError, NotFoundError, TedsProvisionError
-from tests.parsed import parsed
+from tests.parsed import walked
 
 
 def test_an_unreadable_word_is_cut_in_the_middle() -> None:
@@ -29,7 +29,7 @@ def test_each_code_of_the_tree_has_an_exit_code_which_the_client_has_too() -> No
     codes = {
         part.value.value
         for file in files
-        for node in ast.walk(parsed(file))
+        for node in walked(file)
         if isinstance(node, ast.ClassDef) and node.name.endswith("Error")
         for part in node.body
         if isinstance(part, ast.Assign | ast.AnnAssign) and ast.unparse(part).startswith("code")

@@ -11,7 +11,7 @@ import importlib.util
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from benchmarks import short
-from tests.parsed import parsed
+from tests.parsed import parsed, walked
 
 ROOT = Path(__file__).parent.parent
 
@@ -92,7 +92,7 @@ def house() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def modules(house: ModuleType) -> dict[str, object]:
-    return dict(house.modules(parsed))
+    return dict(house.modules(walked))
 
 
 def test_no_files_import_each_other(house: ModuleType, modules: dict[str, Any]) -> None:
@@ -114,14 +114,13 @@ def test_modules_of_ours_are_loaded_late_only_for_a_named_reason() -> None:
     assert (late, rooms) == (set(LATE_MODULES), LATE_ROOMS), "import on top; else give the reason here"
 
 
-def many_parameters(tree: ast.AST) -> Iterator[str]:
+def many_parameters(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Yield the functions of more than eight parameters that are no commands."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
             names = [parameter.arg for parameter in every if parameter.arg not in ("self", "cls")]
-            is_command = any("command(" in ast.unparse(part) for part in node.decorator_list)
-            if len(names) > 8 and not is_command:
+            if len(names) > 8 and not any("command(" in ast.unparse(part) for part in node.decorator_list):
                 yield node.name
 
 
@@ -130,7 +129,7 @@ def test_more_than_eight_parameters_have_a_reason(modules: dict[str, Any]) -> No
     found = {
         f"{module.path.relative_to(folder)} {name}"
         for module in modules.values()
-        for name in many_parameters(module.tree)
+        for name in many_parameters(module.nodes)
     }
     assert found - MANY_PARAMETERS.keys() == set(), "hand over one object that has a name, or state the reason above"
     assert MANY_PARAMETERS.keys() - found == set(), "they have fewer now"
@@ -174,16 +173,16 @@ def test_json_of_strangers_is_decoded_in_one_place(modules: dict[str, Any]) -> N
     own = {
         name
         for name, module in modules.items()
-        for node in ast.walk(module.tree)
+        for node in module.nodes
         if "object_pairs_hook" in (getattr(node, "arg", ""), getattr(node, "value", ""))
     }
     assert own == {"teds_provision.json_decoder"}
 
 
-def rooms_named(tree: ast.Module, rooms: set[str]) -> dict[str, str]:
+def rooms_named(nodes: Iterable[ast.AST], rooms: set[str]) -> dict[str, str]:
     """Return the names that stand for a room in this file, with its dotted name."""
     found: dict[str, str] = {}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.module:
             dotted = {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
             found |= {name: room for name, room in dotted.items() if room in rooms}
@@ -191,8 +190,10 @@ def rooms_named(tree: ast.Module, rooms: set[str]) -> dict[str, str]:
 
 
 def loaded_at_run_time(tree: ast.AST) -> Iterator[str]:
-    """Yield what a file imports when it runs: nothing of ``if TYPE_CHECKING``."""
+    """Yield what a file imports when it runs: nothing of ``if TYPE_CHECKING``. No expression imports anything."""
     for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.expr):
+            continue
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             yield from loaded_at_run_time(ast.Module(node.orelse, []))
             continue
@@ -209,17 +210,16 @@ def test_a_module_that_is_reached_through_its_room_is_imported() -> None:
     late = {room for room in rooms if room.partition(".")[2].replace(".", "/") in LATE_ROOMS}
     missing = []
     for path in files.values():
-        tree = parsed(path)
-        named = rooms_named(tree, rooms)
-        loaded = {*loaded_at_run_time(tree)}
-        for node in ast.walk(tree) if named else ():
+        named = rooms_named(walked(path), rooms)
+        loaded = {*loaded_at_run_time(parsed(path))} if named else set()
+        for node in walked(path) if named else ():
             first, *rest = dotted_names(node)
             room = named.get(first, "")
             for part in rest if room else ():
                 module = f"{room}.{part}"
                 if module not in files and module not in rooms:
                     break
-                if room not in late and module not in loaded | set(loaded_at_run_time(parsed_room(files, room))):
+                if room not in late and module not in loaded and module not in loaded_by_a_room(files, room):
                     missing.append(f"{path.relative_to(ROOT)}:{node.lineno} needs {module}")
                 room = module
     assert not missing
@@ -234,10 +234,10 @@ def dotted_names(node: ast.AST) -> list[str]:
     return [node.id, *reversed(parts)] if parts and isinstance(node, ast.Name) else [""]
 
 
-def parsed_room(files: dict[str, Path], room: str) -> ast.Module:
-    """Return the ``__init__`` of a room, parsed; nothing for a module."""
+def loaded_by_a_room(files: dict[str, Path], room: str) -> set[str]:
+    """Return what the ``__init__`` of a room imports when it runs; nothing for a module."""
     path = files.get(f"{room}.__init__")
-    return parsed(path) if path is not None else ast.Module([], [])
+    return {*loaded_at_run_time(parsed(path))} if path is not None else set()
 
 
 def test_every_benchmark_has_a_short_run() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
 import pytest
 
-from tests.parsed import parsed
+from tests.parsed import walked
 
 ROOT = Path(__file__).parent.parent
 _FOLDERS = (ROOT / "docs" / "contract", ROOT / "docs" / "internals", ROOT / "docs", ROOT / "docs" / "adr", ROOT)
@@ -72,7 +73,7 @@ ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`~?([^`]+)`")
 def defined(path: Path) -> set[str]:
     """Functions, classes and constants that a file makes."""
     found = set()
-    for node in ast.walk(parsed(path)):
+    for node in walked(path):
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
                 found.add(name)
@@ -129,12 +130,12 @@ def test_the_glossary_names_files_that_exist_and_defines_each_word_once() -> Non
         assert sorted(set(words)) == sorted(words), section.splitlines()[0]
 
 
-def unknown_roles(path: Path, text: str, every: set[str]) -> list[str]:
+def unknown_roles(path: Path, text: str, nodes: Iterable[ast.AST], every: set[str]) -> list[str]:
     """References such as :func:`name` to what neither the file knows nor, with a dot, the package."""
     if not ROLE.search(text):
         return []
     known = set(defined(path))
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes:
         match node:
             case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name):
                 known.add(name)
@@ -158,10 +159,13 @@ def test_what_docstrings_refer_to_exists() -> None:
     files = sorted(PACKAGE.rglob("*.py"))
     every = set().union(*map(defined, files))
     assert [
-        unknown_role for path in files for unknown_role in unknown_roles(path, path.read_text(encoding="utf-8"), every)
+        unknown_role
+        for path in files
+        for unknown_role in unknown_roles(path, path.read_text(encoding="utf-8"), walked(path), every)
     ] == []
     here = PACKAGE / "limits.py"
-    assert len(unknown_roles(here, "x = 1  # :func:`gone` :mod:`.gone` :func:`x`", every)) == 2
+    text = "x = 1  # :func:`gone` :mod:`.gone` :func:`x`"
+    assert len(unknown_roles(here, text, ast.walk(ast.parse(text)), every)) == 2
 
 
 def unknown_sees(text: str, every: set[str]) -> list[str]:
@@ -175,7 +179,7 @@ def test_each_name_that_a_docstring_says_to_see_exists() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}: see {name}"
         for path in files
-        for node in ast.walk(parsed(path))
+        for node in walked(path)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
         for name in unknown_sees(node.value, every)
     ]
@@ -194,7 +198,7 @@ def texts(*folders: str) -> str:
     found: list[str] = []
     for folder in folders:
         for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(parsed(path)):
+            for node in walked(path):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
                     found.append(node.value)
                 elif isinstance(node, ast.JoinedStr):
