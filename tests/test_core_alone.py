@@ -26,7 +26,7 @@ from tests.plant.stations import Plant, ask
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
-_LEFT = ("__pycache__", "build", "dist", ".venv*", ".git", "*.egg-info", ".*_cache", ".hypothesis")
+_LEFT = ("build", "dist", ".venv*", ".git", "*.egg-info", ".*_cache", ".hypothesis")
 _NAMES = "|".join(OPTIONAL)
 _OF_A_ROOM = re.compile(
     rf"^\s*(?:from|import) (?:teds_provision|tests)\.(?:{_NAMES})\b"
@@ -42,7 +42,7 @@ _GATE = (
 
 @pytest.fixture(scope="module")
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Copy of the tree without the optional rooms and their tests."""
+    """Copy of the tree without the optional rooms and their tests; what is compiled already is in it."""
     folder = tmp_path_factory.mktemp("core") / "tree"
     shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*_LEFT), symlinks=True)
     for room in OPTIONAL:

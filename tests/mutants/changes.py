@@ -125,6 +125,14 @@ class Module:
         """Every function with its name, that of its class before it; an outer one before those in it."""
         return list(_functions(self.tree, ""))
 
+    @cached_property
+    def by_name(self) -> dict[str, list[ast.FunctionDef | ast.AsyncFunctionDef]]:
+        """The functions of each name: 800 patterns look theirs up in every module."""
+        named: dict[str, list[ast.FunctionDef | ast.AsyncFunctionDef]] = {}
+        for name, function in self.functions:
+            named.setdefault(name, []).append(function)
+        return named
+
     def mutant(
         self,
         node: ast.expr | ast.stmt,
@@ -177,14 +185,12 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
     description = f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
     return [
         replace(
-            module.mutant(node, pattern.now, function, description, _words(module, tree)),
+            module.mutant(node, pattern.now, pattern.function, description, _words(module, tree)),
             test=pattern.test,
             rule=pattern.rule,
         )
         for module in where
-        if pattern.function.rpartition(".")[2] in module.source
-        for function, tree in module.functions
-        if function == pattern.function
+        for tree in module.by_name.get(pattern.function, ())
         for node in ast.walk(tree)
         if isinstance(node, kind) and ast.unparse(node) == wanted  # to unparse all would take twice as long
     ]

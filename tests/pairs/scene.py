@@ -31,7 +31,7 @@ from teds_provision.node.node_template import create
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.station.station import initialise
 from teds_provision.vault.passphrase import THROWAWAY
-from tests.cli.shell import clean_environment
+from tests.cli.shell import clean_environment, zygote
 from tests.e2e.desk import ANGLE, Links
 from tests.measure.rig import provisioned
 from tests.pace import PATIENCE
@@ -223,7 +223,7 @@ class Scenes:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.zygote = Zygote(clean_environment())
+        self.zygote = zygote()
         self._lock = threading.RLock()
         self._numbers = itertools.count()
 
@@ -233,11 +233,7 @@ class Scenes:
         """Scenes in a folder that is removed at the end, in memory if possible."""
         where = MEMORY if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) else None
         with tempfile.TemporaryDirectory(prefix="pairs-", dir=where) as folder:
-            scenes = cls(Path(folder).resolve())
-            try:
-                yield scenes
-            finally:
-                scenes.zygote.close()
+            yield cls(Path(folder).resolve())
 
     def prepared(self, name: str) -> Path:
         """Return the folder of a prepared scene."""

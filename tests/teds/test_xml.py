@@ -13,8 +13,6 @@ from teds_provision.teds.formats import TedsBlock, read_blocks, write_blocks
 from teds_provision.teds.formats.xmlform import NAMESPACE, SCHEMA
 from tests.pace import costs_at_most
 
-xmlschema = pytest.importorskip("xmlschema")
-
 VECTORS = sorted((Path(__file__).parent.parent / "vectors" / "ieee1451").glob("*.hex"))
 PROFILES = sorted((Path(__file__).parent.parent.parent / "profiles").glob("*-sensor.toml"))
 OPEN = f'<teds-set xmlns="{NAMESPACE}">'
@@ -22,6 +20,7 @@ OPEN = f'<teds-set xmlns="{NAMESPACE}">'
 
 @pytest.fixture(scope="module")
 def schema():
+    xmlschema = pytest.importorskip("xmlschema")
     return xmlschema.XMLSchema(str(SCHEMA))
 
 

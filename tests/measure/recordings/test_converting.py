@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from mcap.reader import make_reader
@@ -133,6 +132,8 @@ def test_any_block_survives_mcap_to_json_to_mcap(data_block: Block) -> None:
 
 
 def test_foreign_readers_take_what_was_converted(tmp_path: Path) -> None:
+    import pandas as pd
+
     first = recorded(tmp_path / "run.csv")
     [mcap] = convert(first, tmp_path / "run.mcap").files
     with mcap.open("rb") as file:
@@ -147,6 +148,8 @@ def test_foreign_readers_take_what_was_converted(tmp_path: Path) -> None:
 
 
 def test_a_grid_has_one_row_a_time_and_units_in_its_columns(tmp_path: Path) -> None:
+    import pandas as pd
+
     first = recorded(tmp_path / "run.mcap")
     [wide] = convert(first, tmp_path / "wide.csv", wide=True).files
     table = pd.read_csv(wide, comment="#")
@@ -165,6 +168,8 @@ def test_a_grid_has_one_row_a_time_and_units_in_its_columns(tmp_path: Path) -> N
 
 
 def test_a_grid_is_recorded_as_it_is_converted(tmp_path: Path) -> None:
+    import pandas as pd
+
     sink = open_sink(f"wide:{tmp_path / 'run.csv'}")
     sink.open(FACTS, STATION)
     keys = ((ARM, 1), (HAND, 2))

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from teds_provision.measure.blocks import Block, GroupRows
@@ -52,6 +51,8 @@ def values(path: Path) -> dict[tuple[str, int], list[float]]:
 
 @pytest.mark.parametrize("suffix", [".csv", ".txt", ".jsonl", ".parquet"])
 def test_a_file_holds_what_people_read_and_its_readers_have_si_again(tmp_path: Path, suffix: str) -> None:
+    import pandas as pd
+
     path = tmp_path / f"run{suffix}"
     if suffix == ".parquet":
         convert(recorded(tmp_path / "run.mcap"), path, units="shown")

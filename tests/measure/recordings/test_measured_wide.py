@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from rosbags.highlevel import AnyReader
 
@@ -31,6 +30,8 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 @pytest.mark.realtime  # a value that comes more than 0.1 s late is in the recording, and in no row of the grid
 def test_two_nodes_are_one_grid_which_pandas_reads(rig: Rig, tmp_path: Path) -> None:
+    import pandas as pd
+
     grid, whole = tmp_path / "run.csv", tmp_path / "run.mcap"
     uuids = [node.uuid for node in rig.nodes.values()]
     rig.measure(*uuids, "--rate", 50, "--to", grid, "--to", whole, "--wide", "--duration", 2)
