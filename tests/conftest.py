@@ -24,6 +24,7 @@ from hypothesis import HealthCheck, settings
 from teds_provision.station.station import Station
 from tests.bench import Board, copied_station
 from tests.dealing import dealt
+from tests.examples import limit_examples
 from tests.firmware.c_node import OFFERS
 from tests.nightly import REFUSED, UNNAMED, refusals
 from tests.passphrase_costs import lower_costs
@@ -54,7 +55,7 @@ SHARED = ("rig", "bench", "lab")  # fixtures of a module whose value says ``visi
 
 # Of the checks of health that one alone is about time: examples that a busy machine was slow to make are good examples.
 settings.register_profile("desk", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("quick", settings.get_profile("desk"), max_examples=20)
+settings.register_profile("quick", settings.get_profile("desk"), max_examples=10)
 settings.register_profile("gate", settings.get_profile("desk"), derandomize=True)
 settings.load_profile("gate" if AT_THE_GATE else "desk")
 
@@ -123,6 +124,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.stash[REFUSED] = refusals(items)
     timed: set[Path] = set()
     items[:] = [item for item in items if not _in_c(item) or _needed(item) <= OFFERS]
+    if settings.get_current_profile_name() == "quick":
+        limit_examples(items, settings().max_examples)
     for item in items:
         if item.get_closest_marker("realtime"):
             item.add_marker(pytest.mark.flaky(reruns=2))

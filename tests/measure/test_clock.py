@@ -285,6 +285,7 @@ def begin():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not COUNTS_BLOCKS, reason="the C library does not count its blocks")
 def test_exchanges_leave_nothing_in_the_cache_of_each_nodes_thread() -> None:
     """The fit of n exchanges took arrays of n numbers: blocks of each size stayed with each thread, 10 kB a node."""

@@ -6,6 +6,7 @@ import functools
 import json
 from contextlib import suppress
 
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -29,6 +30,7 @@ def content_or_leaf(octets):
     assert found.bundle == MADE
 
 
+@pytest.mark.slow
 def test_every_single_octet():
     for at in range(len(SEALED)):
         for flip in (0x01, 0x20, 0x80):

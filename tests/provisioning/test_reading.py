@@ -39,11 +39,16 @@ def test_a_teds_that_claims_to_be_endless_is_not_read(board: Board, block: tuple
 def test_the_largest_security_teds_is_read_octet_by_octet(board: Board) -> None:
     teds = frame(bytes(LARGEST_SECURITY - 6))
 
-    def drip(count: int, _reply: bytes) -> bytes:
-        at = count - 1
-        return Reply(True, at.to_bytes(4, "big") + teds[at : at + 1]).encode()
+    class DrippingLink(MemoryLink):
+        """A node that gives an octet at a time."""
 
-    assert read_block(talk(board, MemoryLink(board, tamper=drip)), SECURITY) == teds
+        def exchange(self, frame: bytes) -> bytes:
+            at, self.count = self.count, self.count + 1
+            return Reply(True, at.to_bytes(4, "big") + teds[at : at + 1]).encode()
+
+    link = DrippingLink(board)
+    assert read_block(talk(board, link), SECURITY) == teds
+    assert link.count == len(teds)
 
 
 def test_noise_on_a_plain_read_is_read_again_and_a_teds_that_is_bad_stays_bad(board: Board) -> None:

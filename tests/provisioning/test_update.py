@@ -390,6 +390,8 @@ INTERRUPTIONS = (
     _node_off,
     _node_off_after,
 )
+LATER = (_reply_lost, _station_killed_after, _node_off_after)
+"""Those after the node's answer, which the loop of ``make quick`` leaves to the gate."""
 
 
 def exchanges_of(owner: Owner, folder: Path) -> int:
@@ -425,7 +427,11 @@ def interrupted(owner: Owner, folder: Path, interruption: Callable[[UpdateBench,
     bench.close()
 
 
-@pytest.mark.parametrize("interruption", INTERRUPTIONS, ids=lambda how: how.__name__.strip("_"))
+@pytest.mark.parametrize(
+    "interruption",
+    [pytest.param(how, marks=pytest.mark.slow if how in LATER else ()) for how in INTERRUPTIONS],
+    ids=lambda how: how.__name__.strip("_"),
+)
 def test_an_update_that_is_interrupted_resumes(
     owner: Owner, tmp_path: Path, interruption: Callable[[UpdateBench, int], None]
 ) -> None:

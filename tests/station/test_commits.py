@@ -430,6 +430,7 @@ def begin():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not COUNTS_BLOCKS, reason="the C library does not count its blocks")
 def test_statements_leave_nothing_in_the_cache_of_each_nodes_thread() -> None:
     """The connection's list of cursors was made longer by all threads in turn: each kept its former memory."""

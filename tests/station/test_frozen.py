@@ -38,10 +38,10 @@ except StoreError as failure:
 """
 
 
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a home that a process left by kill -9: one node in the file, one in its write-ahead log alone."""
-    home = tmp_path / "home"
+    home = tmp_path_factory.mktemp("left") / "home"
     with Station.make(home) as store:
         store.nodes.restore(NodeRecord(ONE))
         store.audit("test", ONE, "done")
@@ -53,6 +53,12 @@ def home(tmp_path: Path) -> Path:
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
     assert (home / "store.sqlite3-wal").stat().st_size > 0
     return home
+
+
+@pytest.fixture
+def home(left: Path, tmp_path: Path) -> Path:
+    """Return a copy of it, for one test."""
+    return shutil.copytree(left, tmp_path / "home")
 
 
 def mounted(home: Path, script: str, *words: str) -> subprocess.CompletedProcess[str]:

@@ -264,10 +264,10 @@ def test_errors_count_even_behind_a_flood_of_notes() -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        b"\xc8\x00" * 4_000_000,
+        pytest.param(b"\xc8\x00" * 4_000_000, marks=pytest.mark.slow),
         b"\x0e\x00" * 4_000_000,
         b"\x81\x04" + struct.pack(">f", 1.0),
-        bytes(9_000_000),
+        pytest.param(bytes(9_000_000), marks=pytest.mark.slow),
         b"\x0c\xfe" + b"\x32\x00" * 127,
     ],
 )

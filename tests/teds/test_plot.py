@@ -21,6 +21,7 @@ from teds_provision.teds.profile import load_profile, shipped_profiles
 from teds_provision.teds.units import parse_unit
 
 pytest.importorskip("matplotlib")
+pytestmark = pytest.mark.slow  # matplotlib alone is half a second
 UUID = bytes(10)
 ROWS = "".join(f"{raw},{raw / 65535 * 10 + 0.05 * (raw % 2)}\n" for raw in range(0, 65536, 5041))
 
