@@ -113,7 +113,8 @@ def test_each_option_of_a_setting_is_made_from_it() -> None:
         f"{path.name}: {flag}"
         for path in (PACKAGE / "cli").rglob("*.py")
         for node in ast.walk(parsed(path))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "click.option" and node.args
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "option" and node.args
+        if ast.unparse(node.func) == "click.option"
         for flag in [getattr(node.args[0], "value", "")]
         if flag in flags
     ]

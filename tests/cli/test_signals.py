@@ -39,8 +39,9 @@ def test_no_signal_handler_takes_a_lock() -> None:
 
     ``IdleStop.request_stop``.
     """
-    found = []
-    for module in MODULES:
+    found, setting = [], [module for module in MODULES if "signal.signal" in module.read_text()]
+    assert setting
+    for module in setting:
         tree = ast.parse(module.read_text())
         functions = {node.name: node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
         for call in ast.walk(tree):
