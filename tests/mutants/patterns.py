@@ -741,6 +741,20 @@ PATTERNS = (
         "tests/teds/test_interpreter.py",
     ),
     Pattern(
+        "a conversion to the other edition keeps octets that form no field",
+        "_Conversion.part",
+        "inner + _loose(part, composer.width)",
+        "inner",
+        "tests/teds/test_codec_editions.py",
+    ),
+    Pattern(
+        "octets of units that form no field are not lost without a finding",
+        "_Conversion.units",
+        'b"" if values.is_packed_units(part.raw) else _loose(part, composer.width)',
+        'b""',
+        "tests/teds/test_codec_editions.py",
+    ),
+    Pattern(
         "an image is of a node with a UUID of 10 octets",
         "_image",
         "not isinstance(uuid, bytes) or len(uuid) != 10",

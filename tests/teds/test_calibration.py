@@ -337,6 +337,22 @@ def test_the_calibrated_unit_is_recognized_again(magnetic: Profile) -> None:
     assert again.unit.to_si(value(again, 65535)) == pytest.approx(2 * math.pi)
 
 
+@pytest.mark.parametrize(
+    ("slope", "intercept", "si"),
+    [(2.0, 5.0, (2.0, 5.0)), (2.0, None, (1.0, 0.0)), (None, 5.0, (1.0, 0.0)), (None, None, (1.0, 0.0))],
+)
+def test_a_conversion_of_which_a_number_cannot_be_read_is_none(
+    slope: float | None, intercept: float | None, si: tuple[float, float]
+) -> None:
+    parts = (teds.Field(30, "Slope", slope, b"", 0), teds.Field(31, "Intercept", intercept, b"", 0))
+    plain = teds.decode(teds.compose(5, SPLINE.fields()))
+    fields = tuple(field for field in plain.fields if field.name != "SIConvrt")
+    converted = replace(plain, fields=(*fields, teds.Field(12, "SIConvrt", None, b"", 0, parts)))
+    unit = from_decoded(converted, channel=1).unit
+    assert (unit.scale, unit.offset) == si
+    assert from_decoded(replace(plain, fields=fields), channel=1).unit.scale == 1.0
+
+
 def test_a_foreign_calibration_is_bad_data_and_nothing_else() -> None:
     foreign = teds.decode(teds.compose(5, [("LinOnly", (1.0, 2.0))]))
     with pytest.raises(BadDataError, match="understood"):

@@ -313,6 +313,14 @@ def test_raw_values_of_a_plain_channel_have_the_uncertainty_that_the_curve_makes
     assert calibrated(columns, angle("%")).uncertainty == pytest.approx(20 * 300 / 100)
     (item,) = items_of(read(columns))
     assert item.to_json()["uncertainty"] == 0.05
+    falling = columns.replace("1 2 5", "5 2 1")
+    assert calibrated(falling, angle("count")).uncertainty == pytest.approx(20 * 3 / 100), "the steepest part falls"
+    percent = table(
+        listed("measuredValue x_rawValue", "10000 20000 30000", r"\percent", expanded("4000")),
+        listed("referenceValue", "1 2 5", r"\one", expanded("0.1")),
+    )
+    assert calibrated(percent, angle("count")).points == ((100, 1), (200, 2), (300, 5))
+    assert calibrated(percent, angle("count")).uncertainty == pytest.approx(20 * 3 / 100)
 
 
 def test_points_come_in_the_order_of_their_raw_values() -> None:

@@ -83,6 +83,38 @@ def test_nanoseconds_beyond_a_second_are_kept_and_warned_about() -> None:
     assert teds.recompose(decoded) == frame(block)
 
 
+@pytest.mark.parametrize(
+    ("fields", "newer", "lost"),
+    [
+        ("1204 280100 29", "1204 280100 29", []),
+        ("1207 280100 290102 2a", "1207 280100 290102 2a", []),
+        ("0c03 320100", "0c0b 0080808080808080808000", []),
+        ("0c04 320100 33", "0c0b 0080808080808080808000", ["The octets 33 of PhyUnits form no field"]),
+        ("0c03 010203", "0c0b 0080808080808080808000", ["The octets 01 02 03 of PhyUnits form no field"]),
+        ("0c0b 0080808080808080808005", "0c0b 0080808080808080808005", []),
+    ],
+)
+def test_octets_that_form_no_field_are_kept_or_their_loss_is_a_finding(
+    fields: str, newer: str, lost: list[str]
+) -> None:
+    """They went without a word."""
+    octets, findings = teds.convert(teds.decode(frame(bytes.fromhex(f"030400030101 {fields}"))), 2024)
+    assert unframe(octets) == bytes.fromhex(f"030500ff030201 {newer}")
+    assert [(f.severity, f.code, f.message) for f in findings] == [
+        ("error", "lost", f"{words}; they are left out.") for words in lost
+    ]
+    back, none = teds.convert(teds.decode(octets), 2007)
+    assert none == []
+    if fields.startswith("12"):
+        assert unframe(back) == bytes.fromhex(f"030400030101 {fields}")
+
+
+def test_octets_that_form_no_field_are_kept_behind_tuples_of_two_length_octets() -> None:
+    octets, findings = teds.convert(teds.decode(frame(bytes.fromhex("030400030102 120006 28000100 2900"))), 2024)
+    assert unframe(octets) == bytes.fromhex("030500ff030202 120006 28000100 2900")
+    assert findings == []
+
+
 def test_sub_family_is_lost() -> None:
     octets = teds.compose(12, {"Format": 0, "TCName": "x", "TEDSID": {"subfamily": 4}}, edition=2024)
     assert [(finding.severity, finding.code) for finding in to(octets, 2007)[1]] == [("error", "lost")]

@@ -11,6 +11,7 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError
+from teds_provision.teds.codec import decode as decode_module
 from teds_provision.teds.codec.frame import frame, raw_tuple
 from teds_provision.teds.codec.model import Edition
 from tests.protocol.operation.kat import KAT
@@ -363,3 +364,30 @@ def test_a_security_teds_of_ours_is_judged_framed_and_bare(framed: bool) -> None
     at = octets.index(b"\x69\x01", 4)  # field 105, ProfileVersion
     twice = octets[4 : at + 3] + octets[at:-2]
     assert codes(frame(twice) if framed else twice)["not-canonical"] == "error"
+
+
+def test_the_largest_teds_and_the_most_tuples_are_read_and_one_more_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    block = bytes.fromhex("0304000c0101") + bytes.fromhex("c80101") * 4
+    monkeypatch.setattr(decode_module, "MAX_OCTETS", len(block))
+    monkeypatch.setattr(decode_module, "MAX_TUPLES", 5)
+    whole = teds.decode(block)
+    assert (whole.verdict, len(whole.fields)) == ("block-clean", 5)
+    monkeypatch.setattr(decode_module, "MAX_TUPLES", 4)
+    (found,) = [finding for finding in teds.decode(block).findings if finding.code == "too-many"]
+    assert (found.message, found.offset) == ("There are more than 4 tuples; the rest is not read.", len(block) - 3)
+    monkeypatch.setattr(decode_module, "MAX_OCTETS", len(block) - 1)
+    refused = teds.decode(block)
+    assert refused.verdict == "malformed"
+    assert refused.findings[0].message == f"This has {len(block)} octets; {len(block) - 1} are read at most."
+
+
+def test_beyond_the_most_findings_only_what_decides_the_verdict_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decode_module, "MAX_FINDINGS", 2)
+    strange = bytes.fromhex("030400030101") + bytes.fromhex("0500") * 4
+    decoded = teds.decode(strange + bytes.fromhex("0509"))
+    assert decoded.verdict == "malformed"
+    assert "not-closed" in {finding.code for finding in decoded.findings}
+    misplaced = bytes.fromhex("030400030101") + bytes.fromhex("280100") * 4
+    found = teds.decode(misplaced)
+    assert [f.code for f in found.findings if f.severity == "error"] == ["top-level", "top-level"]
+    assert "not-closed" in {f.code for f in teds.decode(misplaced + b"\x28\x09").findings}

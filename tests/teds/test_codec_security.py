@@ -214,3 +214,19 @@ def test_what_was_decoded_cannot_be_changed_for_the_next_reader(name: str) -> No
     with pytest.raises(TypeError):
         getattr(security.decode(octets), name)[next(iter(before))] = 0
     assert getattr(security.decode(octets), name) == before
+
+
+@pytest.mark.parametrize(
+    ("places", "good"), [("000001 000003 000101", True), ("000001 000001", False), ("000003 000001", False)]
+)
+def test_signed_blocks_ascend_and_none_is_there_twice(places: str, good: bool) -> None:
+    block = ours(signed_blocks={(0, 1): bytes(32)})[4:-2]
+    one = bytes.fromhex("6c23 000001") + bytes(32)
+    assert block.count(one) == 1
+    listed = b"".join(bytes.fromhex(f"6c23 {place}") + bytes(32) for place in places.split())
+    changed = block.replace(one, listed)
+    if good:
+        assert list(security.decode_block(changed).signed_blocks) == [(0, 1), (0, 3), (1, 1)]
+        return
+    with pytest.raises(security.NotCanonicalError, match="The SignedBlocks do not ascend by channel and access code"):
+        security.decode_block(changed)

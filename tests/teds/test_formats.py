@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
-from teds_provision.teds.formats import FORMATS, TedsBlock, class_of, detect, lost, placed, read_blocks, write_blocks
+from teds_provision.teds.formats import (
+    FORMATS,
+    TedsBlock,
+    class_of,
+    detect,
+    lost,
+    placed,
+    read_blocks,
+    under,
+    write_blocks,
+)
 from teds_provision.teds.formats.intelhex import stretches, write_intel_hex
 from teds_provision.teds.formats.tree import from_tree, shortest, to_tree
 from teds_provision.teds.image import split_run
@@ -180,6 +190,11 @@ def test_a_file_of_junk_is_not_read_for_ever():
 
 def test_a_run_of_framed_teds_is_cut_apart_and_a_broken_one_is_not():
     assert split_run(META + NAME) == [META, NAME]
+    other = frame(bytes.fromhex("0406") + bytes(6))  # no TEDSID: octets of something else that closes by chance
+    for run in (META + other, other + META, other):
+        assert split_run(run) == [run]
+    for cut in (NAME[:-1], NAME[:3], NAME[:4]):
+        assert split_run(META + cut) == [META + cut]
     broken = META + NAME[:-1] + bytes([NAME[-1] ^ 1])
     assert split_run(broken) == [broken]
     assert [block.access_code for block in read_blocks(META + NAME)] == [1, 12]
@@ -280,6 +295,16 @@ def test_a_document_holds_one_teds_for_each_place():
     assert placed(lines(name, own)) == {(0, 12): name}
     with pytest.raises(BadDataError, match=r"^It holds no TEDS\.$"):
         placed(lines(own))
+
+
+def test_teds_of_another_node_differ_in_the_uuid_of_the_2007_form_alone() -> None:
+    blocks = {(0, 1): META, (0, 12): NAME}
+    meta = teds.compose(1, {"UUID": b"\1" * 10, "OholdOff": 1.0, "TestTime": 0.0, "MaxChan": 1})
+    assert under(blocks, b"\1" * 10) == {(0, 1): meta, (0, 12): NAME}
+    assert under(blocks, bytes(range(10))) == blocks
+    assert under({(0, 12): NAME}, b"\1" * 10) == {(0, 12): NAME}
+    long = {(0, 1): teds.compose(1, {"UUID": bytes(range(16)), "MaxChan": 1}, edition=2024)}
+    assert under(long, b"\1" * 10) == long
 
 
 def test_json_can_be_written_by_hand_without_octets():

@@ -190,6 +190,11 @@ def test_a_reversed_slope_is_refused_against_the_profile_alone(tactile: Profile)
     assert codes(findings) == {"reversed"}
 
 
+def test_a_curve_whose_ends_differ_by_rounding_alone_is_not_reversed(tactile: Profile) -> None:
+    table = replace(fit([(0, 0.0), (30000, 5.0), (65535, -1e-7)], "table", channel=1), unit=parse_unit("N"))
+    assert codes(check_calibration(built(tactile, table), None, tactile)) == {"not-monotone"}
+
+
 def test_a_reversed_slope_is_refused_by_what_the_teds_itself_carries(tactile: Profile) -> None:
     text_ = "# channel: 1\n# method: linear\n0,10\n65535,0\n"
     calibration = read_calibrations(text_, "x.csv", tactile)[1]
@@ -649,3 +654,12 @@ def test_a_set_point_and_a_channel_of_no_width_have_no_share_of_a_range_to_chang
     flat = teds.compose(3, {"PhyUnits": parse_unit("N").units, "LowLimit": 5.0, "HiLimit": 5.0})
     old, new = ({**built(tactile, force_line(zero)), (1, 3): flat} for zero in (0.0, 3.0))
     assert "changed" not in codes(check_calibration(new, old), "warning")
+
+
+@pytest.mark.parametrize("ends", [(5.0, 5.0), (0.0, math.inf), (math.nan, 9.0), None], ids=str)
+def test_a_channel_without_a_range_of_raw_values_gives_what_its_calibration_covers(
+    ends: tuple[float, float] | None, tactile: Profile
+) -> None:
+    channel = replace(channel_of(1, built(tactile, force_line()), tactile), raw=ends)
+    (axis,) = curve_of(force_line(), channel, {}, dense=True).axes
+    assert (axis[0], axis[-1]) == (0.0, 65535.0)

@@ -624,6 +624,14 @@ def test_a_refused_set_point_is_stated_in_the_unit_that_was_written() -> None:
         "20 cm exceeds the limits of channel 1 (opening set point), 0 to 11 cm."
     )
     assert interpreter.beyond(too_far).startswith("0.2 m exceeds the limits of channel 1")
+    backwards = replace(parse_unit("cm"), text="x", scale=-0.01)
+    assert "-20 x exceeds the limits of channel 1 (opening set point), -11 to " in interpreter.beyond(
+        too_far, backwards
+    )
+    low, high = interpreter.limits
+    assert interpreter.beyond(high * (1 + 2e-7)) == "", "within the rounding of a Float32"
+    for beyond in (high * (1 + 1e-5), low - 1e-3, math.inf, -math.inf, math.nan):
+        assert interpreter.beyond(beyond) != "", beyond
 
 
 def test_what_a_compensated_channel_needs_is_named_on_the_way_back() -> None:

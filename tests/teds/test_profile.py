@@ -32,7 +32,7 @@ from teds_provision.teds.profile import (
     shipped_profiles,
     template,
 )
-from teds_provision.teds.profile.load import files_digest, listed, parse_profile
+from teds_provision.teds.profile.load import describe_channel, files_digest, listed, parse_profile
 from teds_provision.teds.profile.model import CalibrationDemand
 from teds_provision.teds.profile.reader import key_lines
 from teds_provision.teds.show import describe
@@ -174,6 +174,38 @@ def test_a_broken_profile_is_listed_with_its_error(tmp_path: Path) -> None:
         "links": ["nfc", "can"],
         "channels": 1,
     }
+
+
+def test_a_channel_of_a_type_as_data(tmp_path: Path) -> None:
+    """In the unit of the channel; an uncertainty is a difference, a time is in seconds."""
+    text = GOOD.replace('unit = "N"', 'unit = "degC"').replace("uncertainty = 0.1", 'uncertainty = "0.1 K"')
+    (channel,) = load_profile(write(tmp_path, "force", text)).channels
+    expected: dict[str, object] = {
+        "number": 1,
+        "name": "force",
+        "type": "sensor",
+        "unit": "degC",
+        "low_limit": 0.0,
+        "high_limit": 10.0,
+        "uncertainty": 0.1,
+        "frame": None,
+        "raw_range": [0.0, 4095.0],
+        "sampling_period": 0.001,
+        "calibration": {
+            "required": False,
+            "method": None,
+            "degree": None,
+            "monotone": None,
+            "interval": None,
+            "zero_offset": False,
+            "standard_deviation": None,
+        },
+    }
+    found = describe_channel(channel)
+    for name in ("low_limit", "high_limit", "uncertainty"):
+        assert found.pop(name) == pytest.approx(expected.pop(name), abs=1e-9), name  # type: ignore[arg-type]
+    assert found == expected
+    assert describe_channel(replace(channel, frame="a"))["frame"] == "a"
 
 
 def test_an_unknown_profile_is_not_found_and_the_nearest_is_named() -> None:

@@ -128,6 +128,19 @@ def test_contradictions_between_teds_are_found() -> None:
     assert (0, "channels") in {(finding.channel, finding.code) for finding in Sheet.from_blocks(blocks).findings}
 
 
+def test_the_channels_that_are_counted_are_those_that_are_described() -> None:
+    image = image_of("magnetic-angular-position-sensor")
+    for stated, message in (
+        (1, None),
+        (0, "The Meta-TEDS counts 0 channels; 1 are described."),
+        (2, "The Meta-TEDS counts 2 channels; 1 are described."),
+    ):
+        meta = teds.compose(1, {"UUID": UUID, "OholdOff": 1.0, "TestTime": 0.0, "MaxChan": stated})
+        findings = Sheet.from_image(Image(UUID, {**image.blocks, (0, AccessCode.META): meta})).findings
+        assert [finding.message for finding in findings] == [message] * (message is not None)
+        assert {(f.channel, f.access_code, f.severity, f.code) for f in findings} <= {(0, 1, "warning", "channels")}
+
+
 def test_a_name_finds_its_channel_only_if_it_is_alone() -> None:
     blocks = dict(image_of("tactile-finger-sensor").blocks)
     first = Sheet.from_blocks(blocks).channels[0]

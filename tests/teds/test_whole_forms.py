@@ -450,6 +450,13 @@ def test_the_tedsid_of_a_written_tree_is_the_one_that_it_names() -> None:
         assert read_xml(xml.encode()) == [block], named
 
 
+def test_a_text_that_is_no_utf_8_goes_as_octets_through_json_and_xml() -> None:
+    block = TedsBlock(0, 11, teds.compose(11, [("Text", {"LangCode": "en", "Text": b"\xff\x00", "Compress": 1})]))
+    (entry,) = json.loads(write_json([block]))["teds"]
+    assert entry["fields"][0]["fields"][-1] == {"name": "Text", "kind": "octets", "value": "ff00"}
+    assert read_json(write_json([block])) == read_xml(write_xml([block]).encode()) == [block]
+
+
 def test_a_text_based_teds_has_one_text_of_each_language_in_json_and_xml() -> None:
     texts = [("Text", {"LangCode": code, "Text": text, "Compress": 0}) for code, text in (("en", "<a/>"), ("de", "ä"))]
     block = TedsBlock(0, 11, teds.compose(11, texts))

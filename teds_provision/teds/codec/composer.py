@@ -323,7 +323,7 @@ class _Conversion:
             return self.instant(part, spec, composer)
         if part.children:
             inner = b"".join(self.part(child, spec.by_type, composer) for child in part.children)
-            return composer.tuple(part.type, inner)
+            return composer.tuple(part.type, inner + _loose(part, composer.width))
         return composer.tuple(part.type, part.raw)
 
     def unknown(self, part: Field, composer: Composer) -> bytes:
@@ -351,6 +351,10 @@ class _Conversion:
             self.add_finding(
                 "error", "lost", f"Packed units have no place for the fields {strange} of {part.name}.", part
             )
+        loose = b"" if values.is_packed_units(part.raw) else _loose(part, composer.width)
+        if loose:
+            message = f"The octets {loose.hex(' ')} of {part.name} form no field; they are left out."
+            self.add_finding("error", "lost", message, part)
         return composer.value(spec, part.value)
 
     def instant(self, part: Field, spec: FieldSpec, composer: Composer) -> bytes:
@@ -396,6 +400,11 @@ class _Conversion:
             return []
         entries = [part for part in fields if part.name == "DirBlock"]
         return entries if len(entries) == len(self.decoded.text) else []
+
+
+def _loose(part: Field, width: int) -> bytes:
+    """Return the octets of a structure that form no whole tuple: those behind its last child."""
+    return part.raw[sum(1 + width + len(child.raw) for child in part.children) :]
 
 
 def _directory(entry: Field) -> dict[str, object]:
