@@ -108,6 +108,14 @@ def test_a_node_has_address_uuid_and_longest_message_of_identify(rig: Rig) -> No
     assert [link_name(number) for number in (0xF1, 7)] == ["can:f1", "can:07"]
 
 
+def test_an_announce_that_has_left_is_due_no_more(rig: Rig, clock: list[float]) -> None:
+    rig.node.claim.start(clock[0])
+    assert rig.node.claim.due(clock[0]) is not None
+    rig.node.announce()
+    assert rig.node.claim.due(clock[0]) is None
+    assert len(rig.sent) == 1
+
+
 def test_of_a_station_four_requests_wait(rig: Rig) -> None:
     state, _ = rig.station()
     for number in range(6):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 import pytest
 
@@ -235,6 +235,21 @@ def test_what_was_committed_before_the_node_was_taken_is_what_runs(
     node = VirtualNode(tmp_path / "node", exclusive=True)
     assert node.tim.flash.epoch == 7
     node.flash_file.release()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"key": 7}, {"key": "xy"}, {"key": None}, {"flash": 7}, {"flash": []}, {"flash": None}, {"flash": {}},
+     {"max_message": None}, {"max_message": "many"}, {"max_message": 0}, {"hardware": 7}, {"hardware": [[1, 3]]},
+     {"hardware": [[1, 3, "xy"]]}, {"firmware": 7}, {"firmware": []}, {"firmware": {}}, {"format": "another"},
+     {"name": ...}],
+)  # fmt: skip
+def test_a_member_of_another_form_is_a_damaged_flash(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = FlashFile.create(tmp_path / "node").path
+    whole = json.loads(path.read_text()) | change
+    path.write_text(json.dumps({name: value for name, value in whole.items() if value is not ...}))
+    with pytest.raises(BadDataError, match="not a virtual node's flash"):
+        FlashFile(tmp_path / "node")
 
 
 @pytest.mark.parametrize("document", ["", "[]", "{}", '{"format": "teds-virtual-node/1"}', "damaged key"])

@@ -267,6 +267,8 @@ def test_of_lines_that_are_none_the_first_and_each_thousandth_is_reported() -> N
     ("line", "why"),
     [
         (b"{", "it is not JSON"),
+        (b"[" * 60_000, "it is not JSON"),
+        (b"\xff", "it is not JSON"),
         (b"5", "it is not a JSON object"),
         (b'{"t": 1, "value": []}', '"value" is not an object of channel names and numbers'),
         (b'{"t": 1, "raw": 5}', '"raw" is not an object of channel names and numbers'),

@@ -256,6 +256,20 @@ def test_an_address_of_ble_that_cannot_be_kept_is_named(tmp_path: Path, monkeypa
         StaticAddress(tmp_path, factory=True)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "7", "[]", "{}", '{"address": 7}', '{"address": "xy"}', "[" * 4000, "\xff" * 5000,
+     '{"address": "c0"}', '{"address": "401122334455"}', '{"address": null}'],
+)  # fmt: skip
+def test_a_file_that_holds_no_static_address_is_made_anew(tmp_path: Path, text: str) -> None:
+    (tmp_path / "ble.json").write_text(text, "latin-1")
+    made = StaticAddress(tmp_path, factory=True)
+    kept = json.loads((tmp_path / "ble.json").read_text())
+    assert int(kept["address"][:2], 16) & 0xC0 == 0xC0
+    assert len(kept["address"]) == 12
+    assert StaticAddress(tmp_path, factory=True).address == made.address
+
+
 def test_a_simulation_whose_connection_breaks_has_ended() -> None:
     class Broken:
         def recv(self, _most: int) -> bytes:

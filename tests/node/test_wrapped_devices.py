@@ -467,6 +467,12 @@ def test_iio_devices_that_cannot_be_wrapped(sysfs: Callable[..., Path], tmp_path
     sysfs("iio:device2", name="broken", in_temp_raw="1", in_temp_scale="a lot")
     with pytest.raises(BadDataError, match="in_temp_scale holds 'a lot'"):
         describe(f"iio:broken?root={tmp_path}")
+    for text in ("", " ", "nan", "1e999"):
+        with pytest.raises(BadDataError, match="which is not a number"):
+            iio_device._number(Path("in_temp_scale"), text)
+    assert iio_device._number(Path("in_temp_scale"), "0.5 x") == 0.5
+    (tmp_path / "huge").write_text("1" * 100_000)
+    assert [iio_device._text(tmp_path / name) for name in ("huge", "none")] == ["", ""]
     origin = describe(f"iio:bmp280?root={tmp_path}").origin
     for place in (SensorPlace("iio:bmp280", "socketcan:can0"), SensorPlace("iio:bmp280", None, (1,))):
         with pytest.raises(UsageError):

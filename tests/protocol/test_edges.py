@@ -32,7 +32,7 @@ from teds_provision.protocol.keys import (
     verify_each_once,
 )
 from teds_provision.protocol.messages import smp
-from teds_provision.protocol.messages.arguments import _octets, read_plain
+from teds_provision.protocol.messages.arguments import _octets, read_plain, write_plain
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.messages.message import compose_command, compose_service
 from teds_provision.protocol.messages.tables import describe_request
@@ -422,6 +422,18 @@ def test_arguments_one_after_the_other(layout: str, payload: str, values: list[A
     arguments, found = read_plain(bytes.fromhex(payload), layout, 6)
     assert [argument.value for argument in arguments] == values
     assert [finding.code for finding in found] == findings
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [("u8", "x"), ("u8", None), ("u8", 256), ("u8", -1), ("f32", "x"), ("f32", 1e39), ("time", 5), ("duration", None),
+     ("duration", 1e300), ("text", 5), ("text", "a\0"), ("octets", "text"), ("octets", 5), ("o16", b"short"),
+     ("uuids", (1,)), ("u16s", (65_536,)), ("texts", 7)],
+)  # fmt: skip
+def test_a_value_that_fits_no_argument_is_named(kind: str, value: Any) -> None:
+    with pytest.raises(BadDataError) as no:
+        write_plain(f"it:{kind}", {"it": value}, of="Read")
+    assert no.value.message == f"The argument 'it' of Read does not fit {kind}: {value!r}."
 
 
 def test_a_text_of_a_message_holds_no_nul() -> None:

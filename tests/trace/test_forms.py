@@ -8,6 +8,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -266,13 +267,22 @@ def test_a_record_as_a_line() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("change", [{"direction": "up"}, {"layer": "octet"}, {"octets": "0"}, {"time": "now"}])
-def test_a_line_that_is_no_record_is_named_unless_it_was_cut_off(change: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    "change", [{"direction": "up"}, {"layer": "octet"}, {"octets": "0"}, {"time": "now"}, {"time": 7}, {"octets": None}]
+)
+def test_a_line_that_is_no_record_is_named_unless_it_was_cut_off(change: dict[str, Any]) -> None:
     good = lines.line(Record(0.0, "in", "can", "frame", b""))
     bad = json.dumps({**json.loads(good), **change}).encode()
     with pytest.raises(BadDataError, match="Line 4 of the trace"):
         list(lines.read_lines(lines.head() + good + b"\n" + bad + b"\n" + good))
     assert len(list(lines.read_lines(lines.head() + good + bad))) == 1
+
+
+@pytest.mark.parametrize("bad", [b"{", b"7", b"[]", b"{}", b"[" * 100_000, b"\xff"])
+def test_a_line_of_a_trace_that_is_no_object_of_it_is_named(bad: bytes) -> None:
+    with pytest.raises(BadDataError, match="Line 2 of the trace is not a valid record"):
+        list(lines.read_lines(lines.head() + bad + b"\n"))
+    assert list(lines.read_lines(lines.head() + bad)) == []
 
 
 def test_a_trace_that_nothing_was_written_to_is_removed_if_it_is_not_kept(tmp_path: Path) -> None:
