@@ -16,7 +16,7 @@ from teds_provision.provisioning import datasheet_edit
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.provisioning.calibration_guard import guard
-from teds_provision.provisioning.datasheet_edit import plan_sheet, write_sheet
+from teds_provision.provisioning.datasheet_edit import DatasheetChangedError, plan_sheet, write_sheet
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
@@ -150,6 +150,21 @@ def test_a_datasheet_by_document_keeps_a_draft_that_was_not_written(
         done = write_sheet(station, node, blocks, SilentReporter())
     assert any("draft drop" in warning for warning in done.plan.warnings)
     assert station.datasheets.draft(board.uuid) == draft
+
+
+def test_a_datasheet_without_a_uuid_is_for_any_node_and_is_compared_with_what_was_read(
+    station: Station, board: Board, calibrated: Path
+) -> None:
+    stored = station.datasheets.datasheet(board.uuid)
+    assert stored is not None
+    blocks = dict(stored.unsigned_blocks())
+    blocks[0, AccessCode.META] = load_profile(ANGLE).build(bytes(10)).blocks[0, AccessCode.META]
+    with talk(board) as node:
+        digest = plan_sheet(station, node, blocks).present.image.digest()
+        plan_sheet(station, node, blocks, expected=("00" * 32, digest))
+        for expected in (("00" * 32,), ()):
+            with pytest.raises(DatasheetChangedError, match="has changed since it was read"):
+                plan_sheet(station, node, blocks, expected=expected)
 
 
 def test_a_datasheet_by_document_that_cannot_be_written_or_is_not_authentic_in_the_end(

@@ -5,21 +5,28 @@ from __future__ import annotations
 import hashlib
 import hmac
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError, StoreChangedError, WrongPassphraseError
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.row_macs import RowMacs
 from teds_provision.station.station import Station, initialise, rewrap
 from teds_provision.station.store.records import RevocationRecord, TrustRecord, WhitelistEntry
-from teds_provision.vault import passphrase
+from teds_provision.station.store.row_sample import RowSample
+from teds_provision.vault import passphrase, selection
 from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.selection import forget_vaults
+from tests.pace import PATIENCE
 
 NODE = bytes(range(10))
 POINT = SoftwareKey.generate().point
@@ -75,6 +82,34 @@ def behind_its_back(home: Path, *statements: str) -> None:
     with closing(sqlite3.connect(home / "store.sqlite3")) as database, database:
         for statement in statements:
             database.execute(statement)
+
+
+def test_without_a_sample_every_row_is_checked() -> None:
+    macs, asked = RowMacs(lambda: pytest.fail("no row, no MAC")), []
+    macs.sources = (lambda sample: (asked.append(sample.full), iter(()))[1],)
+    assert list(macs.all_broken()) == []
+    assert list(macs.all_broken(RowSample())) == []
+    assert asked == [True, False]
+
+
+def test_of_two_threads_that_need_the_vault_one_asks_for_the_passphrase(
+    opened: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = opened([])
+    assert station._vault is None
+    both, opens = threading.Barrier(2), []
+    open_vault = selection.open_vault
+
+    def counted(*words: Any, **more: Any) -> Any:
+        opens.append(1)
+        return open_vault(*words, **more)
+
+    monkeypatch.setattr("teds_provision.station.station.selection", SimpleNamespace(open_vault=counted))
+    monkeypatch.setattr(station._store, "drain", lambda: both.wait(PATIENCE))  # both have seen that it is closed
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda _: station.vault, range(2))
+    assert first is second
+    assert opens == [1]
 
 
 def test_an_untouched_store_says_nothing(opened: Open) -> None:

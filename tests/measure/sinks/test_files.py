@@ -48,7 +48,8 @@ from teds_provision.measure.blocks import (
 )
 from teds_provision.measure.sinks import ThreadedSink, as_sink_failure, files, json_events, open_sink
 from teds_provision.measure.sinks.files import Part
-from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
+from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink, plain_samples
+from teds_provision.measure.sinks.mcap.recording import samples as sample_records
 from teds_provision.measure.sinks.mcap.recover import recover
 from teds_provision.measure.sinks.mcap.writer import MAGIC, McapSummary, text
 from teds_provision.measure.sinks.mcap.writer import record as mcap_record
@@ -1332,3 +1333,13 @@ def test_a_recorder_that_has_nothing_to_do_looks_after_its_part(
     sink._finish()
     sink._idle(7.0)
     assert looks == [5.0, 6.0]
+
+
+def test_a_sample_of_mcap_has_the_low_32_bits_of_its_number_as_sequence() -> None:
+    plain = plain_samples(7, 1, integral=True)
+    found = sample_records(block([[1], [2]], index=(1 << 32) + 70_000), plain)
+    assert found["sequence"].tolist() == [70_000, 70_001]
+    assert found["index"].tolist() == [(1 << 32) + 70_000, (1 << 32) + 70_001]
+    assert found["test"].tolist() == [False, False]
+    assert sample_records(block([[1]], test_pattern=True), plain)["test"].tolist() == [True]
+    assert np.isnan(sample_records(block([[1]], clock_error=None), plain)["clock_error"]).all()
