@@ -84,7 +84,7 @@ def _require_pair(certificate: Path, key: Path) -> None:
             raise BadDataError(f"{path} is empty.")
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, no_passphrase)
-    except (ssl.SSLError, OSError) as error:
+    except OSError as error:  # ssl.SSLError is one
         raise BadDataError(
             f"{certificate} and {key} are not a certificate and its key: {getattr(error, 'reason', None) or error}.",
             hint="Both must be PEM files, and the certificate must come first in its file.",

@@ -168,6 +168,18 @@ def test_the_table_names_every_rule_and_what_was_seen(explained: Any, lines: lis
     assert rows[6:] == lines
 
 
+def test_on_a_narrow_terminal_no_value_is_broken_into_lines() -> None:
+    """They are copied into a firmware's log, digit by digit."""
+    seen = io.StringIO()
+    console: Any = Console(file=seen, force_terminal=True, no_color=True, width=50)
+    commands._table(console, CheckReport(UUID, (PASSED,), None, EXPLAINED))
+    assert f"En                 04{'65' * 64}\n" in seen.getvalue()
+    commands._table(
+        console, CheckReport(UUID, (PASSED,), None, "No agreement was made, and this says at length why not.")
+    )
+    assert "No agreement was made, and this says at length why not.\n" in seen.getvalue()
+
+
 def test_the_command_hangs_on_the_group_node() -> None:
     added: list[Any] = []
     group = click.Group("node")

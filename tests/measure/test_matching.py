@@ -27,6 +27,8 @@ def test_an_expression_is_terms_that_must_all_hold() -> None:
     assert match.fits is not None
     assert [term.text for term in match.fits.terms] == ["angle >= 360 deg", "rate >= 1 kHz"]
     assert NodeMatch.parse("all") == NodeMatch("all")
+    spaced = NodeMatch.parse(" type: angle-sensor , name: arm-* , group: left")
+    assert (spaced.types, spaced.names, spaced.groups) == (("angle-sensor",), ("arm-*",), ("left",))
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,9 @@ def test_a_rate_that_does_not_fit_is_refused_and_the_datasheets_is_slowed_with_t
     with pytest.raises(NoRoomError, match=r"50000 Hz does not fit the bus \(60% of it for data\)") as refused:
         plan_node(fast, BUS, rate=50_000.0)
     assert refused.value.hint == f"The maximum is --rate {rate:.6g}"
+    for slower in (1.0, 2.0, 1.5, 7 / 3):
+        [stream] = plan_node(channels(0.01), BUS, slower=slower).streams
+        assert (stream.subscribe.period, type(stream.subscribe.period)) == (round(10_000_000 * slower), int)
     halved = plan_node(channels(0.01), BUS, slower=2.0)
     assert halved.slowed == "slowed from 100 Hz to 50 Hz: the node allows no shorter period"
     with pytest.raises(NoRoomError, match="no capacity left"):

@@ -392,6 +392,23 @@ def test_a_measurement_whose_end_has_passed_still_measures_for_a_moment(
     assert job.measurement is None
 
 
+@pytest.mark.parametrize(("late", "named"), [(1, 1), (3, 3), (4, 3)])
+def test_of_the_nodes_that_hold_up_a_trigger_three_are_named(late: int, named: int) -> None:
+    notes: list[str] = []
+    nodes = [
+        SimpleNamespace(uuid=bytes([number]), ready=SimpleNamespace(is_set=lambda ready=ready: ready))
+        for number, ready in enumerate([True] + [False] * late)
+    ]
+    common = SimpleNamespace(due=lambda ready, all_of: False, notice_due=lambda: True)
+    made: Any = SimpleNamespace(
+        request=SimpleNamespace(trigger=True), supervisors=nodes, _common_start=common,
+        watcher=SimpleNamespace(note=notes.append),
+    )  # fmt: skip
+    Measurement._trigger(made)
+    names = ", ".join(f"{number:02x}" for number in range(1, named + 1)) + (" …" if late > named else "")
+    assert notes == [f"Waiting for {names} before the trigger, up to 15 s."]
+
+
 # -- calibration points and zero ---------------------------------------------------------------------------------------
 
 

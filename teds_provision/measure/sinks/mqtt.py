@@ -147,13 +147,13 @@ class MqttSink(ThreadedSink):
             _octets(named, path)  # checks the size: the library opens files by name, without a limit
         try:
             context = ssl.create_default_context(cafile=self._files.get("ca"))
-        except (ssl.SSLError, OSError) as error:
+        except OSError as error:  # ssl.SSLError is one
             raise BadDataError(f"{self._files.get('ca')} contains no CA certificate in PEM format.") from error
         if "cert" in self._files:
             own, key = self._files["cert"], self._files.get("key")
             try:
                 context.load_cert_chain(own, key, password=_no_password)
-            except (ssl.SSLError, OSError, ValueError) as error:
+            except (OSError, ValueError) as error:
                 raise BadDataError(
                     f"{own} and {key or own} are not a certificate and its key (PEM, unencrypted).",
                     hint="Give them as cert=PATH and key=PATH; openssl pkey removes the passphrase from a key.",

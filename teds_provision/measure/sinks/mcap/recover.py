@@ -14,7 +14,7 @@ import stat
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -575,7 +575,6 @@ def _inside(body: bytes) -> Iterator[tuple[int, int, bytes]]:
     """Yield records of a chunk or of a summary: offset, op code, content."""
     at = 0
     while at + HEAD.size <= len(body):
-        with suppress(struct.error):
-            code, length = HEAD.unpack_from(body, at)
-            yield at, code, body[at + HEAD.size : at + HEAD.size + length]
-            at += HEAD.size + length
+        code, length = HEAD.unpack_from(body, at)
+        yield at, code, body[at + HEAD.size : at + HEAD.size + length]
+        at += HEAD.size + length
