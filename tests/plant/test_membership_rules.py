@@ -139,6 +139,20 @@ def test_a_request_stays_the_same_until_the_name_changes_or_a_wrong_clock_dated_
         assert open_request(again).login == asked.login, "the login stays"
 
 
+def test_half_a_login_is_none(station: Station) -> None:
+    station.unlock()
+    assert station.plant.login() is None
+    request(station)
+    kept = station.plant.login()
+    assert kept is not None
+    for name in ("registry-login", "registry-request"):
+        [(value,)] = station._store.execute("SELECT value FROM meta WHERE name = ?", (name,))
+        station._store.execute("DELETE FROM meta WHERE name = ?", (name,))
+        assert station.plant.login() is None
+        station._store.execute("INSERT INTO meta VALUES(?, ?)", (name, value))
+        assert station.plant.login() == kept
+
+
 def test_a_request_of_another_name_is_made_anew_with_the_same_login(station: Station) -> None:
     station.unlock()
     first = open_request(request(station))

@@ -63,6 +63,14 @@ def test_an_entry_is_no_change_for_which_nodes_are_judged_anew(store: Store) -> 
     assert store.changes() != decided, "what another process changed is not known"
 
 
+@pytest.mark.parametrize(("note", "first"), [("4", 4), ("x", 1), ("", 1), ("-4", 1)])
+def test_a_log_that_once_lost_its_end_stays_broken_from_there(logged: Store, note: str, first: int) -> None:
+    logged.execute("INSERT INTO meta VALUES('audit-lost', ?)", (note,))
+    verdict = logged.audit.check()
+    assert (verdict.intact, verdict.first_bad, verdict.count) == (False, first, 6)
+    assert verdict.why == f"the log once ended before entry {first} and was cut there"
+
+
 def test_an_empty_log_is_intact(store: Store) -> None:
     assert store.audit.check().intact
     assert store.audit.check().count == 0

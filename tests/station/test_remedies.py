@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -315,6 +316,29 @@ def test_a_change_that_failed_in_part_or_is_no_text_is_run_again(store: Store) -
         lambda: store.execute("SELECT ?", ("\udcff",)), BadDataError, "A name or text is not valid UTF-8.",
         "Give it in UTF-8.",
     )  # fmt: skip
+
+
+def test_a_failure_in_part_is_not_forgotten_for_another_one_that_was_taken_back(store: Store) -> None:
+    def fail(block: Any) -> None:
+        with suppress(KeyError), block:
+            store.execute("INSERT OR REPLACE INTO meta VALUES('part', 'x')")
+            raise KeyError
+
+    def both() -> None:
+        with store.transaction():
+            store.execute("INSERT INTO meta VALUES('before', 'x')")
+            fail(store.together())
+            fail(store.transaction())
+
+    def apart() -> None:
+        with store.transaction():
+            store.execute("INSERT INTO meta VALUES('before', 'x')")
+            fail(store.transaction())
+
+    refused(both, StoreError, "Part of this change failed, so all of it was undone.", "Run it again.")
+    assert store.execute("SELECT name FROM meta WHERE name IN ('before', 'part')") == []
+    apart()
+    assert store.execute("SELECT name FROM meta WHERE name IN ('before', 'part')") == [("before",)]
 
 
 def test_a_home_that_others_can_reach_or_that_is_none_is_refused_with_the_command(

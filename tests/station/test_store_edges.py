@@ -487,7 +487,7 @@ def test_one_command_waits_a_minute_for_a_node_and_owns_a_measurement_alone(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert not NodeLock(place, NODE).is_taken, "there is no file yet"
-    clock, notices, sleeps = iter([0.0, 59.9, 60.0]), list[str](), list[float]()
+    clock, notices, sleeps = iter([0.0, 1.0, 59.9, 60.0]), list[str](), list[float]()
     with NodeLock(place, NODE), OwnerLock(place, "m1"):
         assert NodeLock(place, NODE).is_taken
         assert not NodeLock(place, bytes(10)).is_taken
@@ -501,7 +501,7 @@ def test_one_command_waits_a_minute_for_a_node_and_owns_a_measurement_alone(
         f"Another command of this station is using node {NODE.hex()}.", "Wait for it to finish, or stop it."
     )  # fmt: skip
     assert notices == [f"Waiting: another command is using node {NODE.hex()}."]
-    assert sleeps == [0.05]
+    assert sleeps == [0.05, 0.05]
     assert (owned.value.message, owned.value.hint) == (
         "Another command owns this measurement.", "Wait for it to finish, or stop it."
     )  # fmt: skip
