@@ -287,6 +287,7 @@ def test_what_a_client_missed_is_told_once() -> None:
             for number in range(several):
                 client.values(json.dumps({"type": "values", "number": number}))
             found.append([json.loads(text) for text in await client.wait()])
+        assert client.dropped == 3, "in all"
         return found
 
     first, second, third = asyncio.run(run())

@@ -178,7 +178,7 @@ def test_a_node_that_is_measured_is_refused_at_once_and_another_is_waited_for(fr
     locks = NodeLocks()
     locks.acquire(NODE, "measurement run", frozen=True)
     with pytest.raises(FrozenError) as no:
-        locks.acquire(NODE, "write", wait=PATIENCE, frozen=frozen)
+        locks.acquire(NODE, "write", wait=2.0, frozen=frozen)
     assert no.value.message == f"Node {NODE} is being measured (measurement run) and cannot be changed now."
     assert no.value.hint == "End the measurement first."
     locks.acquire("cd" * 10, "it is looked at")

@@ -494,6 +494,8 @@ def test_a_bug_on_a_link_is_shown_and_logged_and_the_link_is_opened_again(
     shown, pauses, opened = list[tuple[str, str, str]](), list[float](), list[tuple[str, Any]]()
 
     def open_place(place: str, trace: Any) -> Any:
+        if place != watch.place:  # the thread of another test that still ends
+            raise LinkError("No reader.")
         opened.append((place, trace))
         raise ZeroDivisionError("bug") if len(opened) < 3 else LinkError("No bus.", hint="Plug it in.")
 
@@ -510,7 +512,8 @@ def test_a_bug_on_a_link_is_shown_and_logged_and_the_link_is_opened_again(
         shown
         == [("failed", "This link failed unexpectedly.", "See the log.")] * 2 + [("link", "No bus.", "Plug it in.")] * 5
     )
-    assert caplog.messages == ["Watching can:x failed; starting again."] * 2
+    logged = [line for line in caplog.messages if line.startswith("Watching")]  # of other tests a thread may still end
+    assert logged == ["Watching can:x failed; starting again."] * 2
     assert opened == [("can:x", None)] * 7
     assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0], "doubled up to half a minute"
 
@@ -734,7 +737,8 @@ def test_the_rest_of_a_datasheet_that_cannot_be_read_now_is_no_problem(
     watch._read_rest(contact)
     assert shown == noted
     bug = f"Reading the rest of node {'ab' * 10} failed."
-    assert caplog.messages == ([bug] if isinstance(error, ZeroDivisionError) else [])
+    logged = [line for line in caplog.messages if line.startswith("Reading")]
+    assert logged == ([bug] if isinstance(error, ZeroDivisionError) else [])
 
 
 def test_the_number_of_strangers_is_an_event_when_it_changed_and_at_most_every_ten_seconds(
