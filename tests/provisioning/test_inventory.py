@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError
-from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.provisioning.inventory import NodeFit, fits_of, inventory, require, search, with_verdicts
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeyRecord, RevocationRecord, Tombstone, WhitelistEntry
@@ -91,6 +91,7 @@ def test_what_only_the_whitelist_knows_of_a_node(station: Station) -> None:
     ("facts", "state"),
     [
         ({"name": "x"}, None),
+        ({"point": SoftwareKey(221).point, "state": 1}, "keyed"),  # its key came in a bundle
         ({"last_seen": "2026-11-28T01:02:03Z", "state": 0}, "factory"),
         ({"last_seen": "2026-11-28T01:02:03Z", "state": 2}, "provisioned"),
         ({"last_seen": "2026-11-28T01:02:03Z", "state": 9}, "unknown (9)"),

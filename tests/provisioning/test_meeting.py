@@ -34,6 +34,7 @@ from teds_provision.provisioning.meeting import (
     likely_places,
     meet,
     pick_single_node,
+    refuse_duplicate_uuids,
     watch_nodes,
 )
 from teds_provision.provisioning.progress import SilentReporter
@@ -97,6 +98,8 @@ def test_a_uuid_that_answers_twice_costs_its_own_node_alone() -> None:
     )
     with pytest.raises(AddressConflictError):
         drop_duplicate_uuids([one, twin], notices.append)
+    with pytest.raises(AddressConflictError, match="answers at 0x0a and at 0x0b: one of them"):
+        refuse_duplicate_uuids([contact(address=0x0A), other, contact(address=0x0B)])
 
 
 # -- where a node is ---------------------------------------------------------------------------------------------------

@@ -570,3 +570,12 @@ def test_a_ca_that_one_node_keeps_certifies_for_this_node_alone(station: Station
     signers = Signers(station_key=signer, station_key_signature=kept.sign(station_key_message(signer)))
     found = [_certifier(station, uuid, signers) for uuid in (board.uuid, bytes(9) + b"\1")]
     assert found == [kept.point, None]
+
+
+def test_a_channel_of_a_reading_has_two_octets() -> None:
+    digests = b"".join(
+        channel.to_bytes(2, "big") + bytes([code, *[code] * 32]) for channel, code in ((0, 1), (1, 3), (258, 5))
+    )
+    row = NodeReading(bytes(10), utc_now(), "read", None, whole=True, digests=digests)
+    assert readings.digests_of(row) == {(0, 1): b"\1" * 32, (1, 3): b"\3" * 32, (258, 5): b"\5" * 32}
+    assert readings.digests_of(replace(row, digests=b"")) == {}

@@ -138,6 +138,9 @@ def test_pieces_shrink_with_each_loss_to_48_octets_and_twenty_losses_are_borne(s
     node = MockNode(lost=[True, False, True, True] + [False] * 20)
     assert stage(station, node, set(BLOCKS) - {(0, 1)}) == 100
     assert [octets for _, octets in node.written] == [50, 48, 2]
+    node = MockNode(max_message=1053, lost=[True])
+    assert stage(station, node, set(BLOCKS) - {(0, 12)}) == 101
+    assert [octets for _, octets in node.written] == [50, 50, 1], "half of what was lost, not of what could be sent"
     node = MockNode(lost=[True] * 20)
     assert stage(station, node, set(BLOCKS) - {(1, 3)}) == 7
     with pytest.raises(NodeSilentError):

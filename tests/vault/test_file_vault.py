@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -428,6 +429,28 @@ def test_a_vault_behind_a_symbolic_link_is_not_opened(tmp_path: Path, vault: Fil
     (tmp_path / "vault.json").symlink_to(tmp_path / "elsewhere.json")
     with pytest.raises(VaultError):
         FileVault.open(tmp_path, STORE, Person())
+
+
+def test_a_vault_is_opened_again_and_written_only_if_there_is_something_new(
+    tmp_path: Path, vault: FileVault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[bytes] = []
+    whole = file_vault.unseal_with
+
+    def unseal_with(held: bytes, content: dict[str, Any], *, context: bytes) -> Any:
+        opened.append(held)
+        return whole(held, content, context=context)
+
+    monkeypatch.setattr(file_vault, "unseal_with", unseal_with)
+    other = FileVault.open(tmp_path, STORE, Person())
+    assert (vault.refresh(), len(opened)) == (False, 0)
+    other.add_master()
+    assert [vault.refresh(), vault.refresh()] == [True, False]
+    assert len(opened) == 1, "what was read is known"
+    other.retire_masters()
+    before = (tmp_path / "vault.json").read_bytes()
+    other.retire_masters()
+    assert (tmp_path / "vault.json").read_bytes() == before, "one master key is the newest"
 
 
 def test_an_unknown_keystore_is_a_usage_error(tmp_path: Path) -> None:

@@ -22,6 +22,13 @@ def test_every_attribute_is_read():
     assert Pkcs11Uri.parse("PKCS11:" + M) == Pkcs11Uri("/lib/m.so")
 
 
+@pytest.mark.parametrize("text", ["", "pkcs11", "pkcs11?module-path=/lib/m.so", "file:token=t"])
+def test_what_is_no_uri_of_a_token_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(UsageError, match="given as a URI that starts with pkcs11:") as refused:
+        Pkcs11Uri.parse(text)
+    assert "module-path=" in refused.value.hint
+
+
 @pytest.mark.parametrize(
     ("path", "shown"),
     [

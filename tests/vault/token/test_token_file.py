@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import stat
+from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import VaultChangedError, VaultError
+from teds_provision.errors import TedsProvisionError, VaultChangedError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.vault import pkcs11
 from teds_provision.vault.master import MasterKeys
@@ -257,3 +258,18 @@ def test_no_ca_key_comes_from_a_file_and_master_keys_of_another_process_are_take
     assert (vault.masters(), vault.unwrap(wrapped, context=b"x")) == ((7,), bytes(16))
     vault.reread()
     assert vault.master_keys().keys == before.keys, "the file says otherwise"
+
+
+def test_a_new_file_takes_the_place_of_none(vault, home, store_id):
+    before = (home / FILE_NAME).read_bytes()
+    with pytest.raises(TedsProvisionError):
+        pkcs11._save(home, store_id, vault._content, replace=False)
+    assert (home / FILE_NAME).read_bytes() == before
+
+
+def test_what_is_read_again_are_the_master_keys_and_not_how_often_the_pin_was_changed(vault, monkeypatch):
+    newer = replace(vault._content, pins=7, masters=vault._content.masters.with_new())
+    pins = vault._content.pins
+    monkeypatch.setattr(pkcs11, "_load", lambda *_: (newer, None))
+    vault.reread()
+    assert (vault._content.pins, vault.masters()) == (pins, (1, 2))

@@ -362,3 +362,18 @@ def test_a_point_is_given_in_der_to_a_module_that_asks_for_it(error, secret):
     assert TokenKey(Key(), POINT, "station", b"\1").ecdh(POINT) == secret.rjust(32, b"\0")
     assert given == [(256, POINT), (256, b"\x04\x41" + POINT)]
     assert destroyed == [1]
+
+
+def test_the_end_of_a_session_is_not_tried_twice(monkeypatch):
+    from pkcs11.exceptions import GeneralError
+
+    tries = []
+
+    def close():
+        tries.append("close")
+        raise GeneralError
+
+    session = TokenSession(SimpleNamespace(close=close), SimpleNamespace(label="bench"))
+    with pytest.raises(VaultError):
+        session.close()
+    assert tries == ["close"]
