@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import StoreError
+from teds_provision.errors import NotFoundError, PolicyError, StoreError
 from teds_provision.handover.incoming import ImportPlan
 from teds_provision.handover.pending import BundleNotes
 from teds_provision.plant.parcels import (
@@ -222,6 +222,25 @@ def test_of_what_expired_without_a_receipt_an_open_move_goes_again_and_a_copy_is
         "closed copy": "closed", "twice": "open", "thrice": "open",
     }, "handover list shows as open what may still be receipted"  # fmt: skip
     assert [name for name, *_ in cases if parcels.shared_in(name)] == ["young move"], "to be shared once more"
+
+
+@pytest.mark.parametrize("error", [PolicyError("It was revoked since."), NotFoundError("It was forgotten since.")])
+def test_a_move_of_which_nothing_may_go_any_more_waits_for_a_person(
+    station: Station, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def planned(*_: object) -> Any:
+        raise error
+
+    monkeypatch.setattr("teds_provision.plant.parcels.outgoing.plan_export", planned)
+    parcels, at = station.plant.parcels, "2026-03-01T12:00:00Z"
+    with station.transaction():
+        for name in ("one", "two"):
+            notes = BundleNotes((A.hex(),), "content", "ca", at).to_json()
+            station.handovers.put(Handover(name, "out", "move", (SOUTH,), "open", notes))
+            parcels.put(ParcelRow(name, "out", SOUTH, "bundle", "sent", at, name, "", "2026-02-22T12:00:00Z"), b"")
+    _expire(station, NOW)
+    assert parcels.all("out", "ready", "sent") == []
+    assert [row.state for row in station.handovers.all()] == ["open", "open"], "`handover undo` reports it"
 
 
 def test_a_receiver_refuses_on_its_own_page_what_came_from_here(station: Station) -> None:

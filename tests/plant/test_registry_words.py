@@ -244,6 +244,19 @@ def test_what_a_sync_prints(home: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert carrier.closed == 5
 
 
+@pytest.mark.parametrize("step", ["sync", "check"])
+def test_a_sync_that_fails_lets_go_of_what_carries(home: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    carrier = Carrier()
+
+    def fails(*_: object, **__: object) -> Any:
+        raise PolicyError("It cannot go on.")
+
+    monkeypatch.setattr(commands, "_transport", lambda *_: (carrier, True))
+    monkeypatch.setattr(plant.sync, "sync", fails if step == "sync" else lambda *_, **__: SyncResult())
+    monkeypatch.setattr(plant.connecting, "check_database", fails)
+    assert (call(home, "registry", "sync").code, carrier.closed) == (6, 1)
+
+
 def test_what_stations_published_is_one_line_each(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     event = {
         "act": "signed", "id": "ff" * 8, "at": AT, "uuid": "8d" * 10, "epoch": 3, "teds_sha256": "ab" * 32,

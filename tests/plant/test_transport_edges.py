@@ -737,6 +737,27 @@ def test_an_earlier_request_is_one_for_exactly_this_the_newest_by_its_sequence(
     assert asked == [("job", NODE, "out")]
 
 
+@pytest.mark.parametrize(
+    "error", [BadDataError("It is damaged."), NotAuthenticError("Nobody signed it."), PolicyError("It is weak.")]
+)
+def test_an_answer_that_cannot_be_read_is_for_no_request(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    office = RemoteOffice.__new__(RemoteOffice)
+    office.station = cast("Any", None)
+    monkeypatch.setattr(sign_requests, "roster_of", lambda _: stub(point_of="points"))
+    monkeypatch.setattr(sign_requests, "load_object", lambda octets, _what: octets)
+
+    def verified(octets: bytes, point_of: object, *, typ: str, max_octets: int) -> Any:
+        assert (octets, point_of, typ, max_octets) == (b"answer", "points", "teds-signed+jws", 65_536)
+        return stub(kid="office", payload={"of": "H"})
+
+    monkeypatch.setattr(sign_requests.jose, "verify_compact", verified)
+    assert office._answered(b" answer\n") == ("office", "H")
+    monkeypatch.setattr(sign_requests, "load_object", raises(error))
+    assert office._answered(b"answer") == ("", "")
+    monkeypatch.setattr(sign_requests.jose, "verify_compact", raises(error))
+    assert office._answered(b"answer") == ("", "")
+
+
 def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:
     for registry in (None, REGISTRY):
         transport = stub(

@@ -14,15 +14,29 @@ from teds_provision.errors import (
     BadDataError,
     FrozenError,
     KeyMismatchError,
+    KeyringUnavailableError,
     NewerStoreError,
     NotFoundError,
     PolicyError,
     StoreError,
     TedsProvisionError,
     UsageError,
+    VaultError,
+    VaultLockedError,
+    WrongPassphraseError,
 )
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
-from teds_provision.station import groups, identity, label, measurements, node_keys, nodes, policy
+from teds_provision.station import (
+    firmware,
+    groups,
+    identity,
+    label,
+    measurements,
+    node_keys,
+    nodes,
+    policy,
+    shown_units,
+)
 from teds_provision.station.policy import PlantConflictError
 from teds_provision.station.station import not_certified
 from teds_provision.station.store import connection, database, dump
@@ -375,3 +389,47 @@ def test_a_home_that_others_can_reach_or_that_is_none_is_refused_with_the_comman
         lambda: database.prepare_home(home, create=False), StoreError, f"{home} belongs to another user.",
         "Run this as its owner, or choose another --home.",
     )  # fmt: skip
+
+
+# -- what is left out because it cannot be read ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error", [NotFoundError("x"), BadDataError("x"), StoreError("x"), FileNotFoundError("x"), PermissionError("x")]
+)
+@pytest.mark.parametrize("at", ["find", "read"])
+def test_a_profile_that_cannot_be_read_demands_nothing_and_shows_no_units(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, at: str
+) -> None:
+    def fails(*_: object) -> Any:
+        raise error
+
+    def found(*_: object) -> Path:
+        return tmp_path
+
+    monkeypatch.setattr(firmware.teds.profile, "find_profile", fails if at == "find" else found)
+    monkeypatch.setattr(firmware, "_demand", fails)
+    monkeypatch.setattr(shown_units, "find_profile", fails if at == "find" else found)
+    monkeypatch.setattr(shown_units, "_read", fails)
+    assert firmware.FirmwareDemands(tmp_path).demand_of("cell") is None
+    assert shown_units._channels_of("cell", tmp_path) == {}
+
+
+def test_a_key_that_is_damaged_hides_no_other_and_a_closed_vault_ends_the_search() -> None:
+    fates: dict[str, Any] = {}
+
+    def unwrap(record: str) -> Any:
+        if isinstance(fates[record], Exception):
+            raise fates[record]
+        return fates[record]
+
+    keys = bare(node_keys.NodeKeys, keys_of=lambda _: list(fates), unwrap=unwrap)
+    fates.update(one=VaultError("one is damaged"), two=b"2", three=VaultError("three is damaged"), four=b"4")
+    found = keys.unwrapped(NODE)
+    assert [next(found).key for _ in "12"] == [b"2", b"4"]
+    with pytest.raises(VaultError, match="three is damaged"):
+        next(found)
+    for error in (WrongPassphraseError("x"), KeyringUnavailableError("x"), VaultLockedError("x")):
+        fates.update(one=error)
+        with pytest.raises(type(error)):
+            next(keys.unwrapped(NODE))

@@ -17,8 +17,9 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import BadDataError, NodeBusyError, StoreError, StoreLockedError
+from teds_provision.errors import BadDataError, FrozenError, NodeBusyError, StoreError, StoreLockedError
 from teds_provision.station import snapshot
+from teds_provision.station.groups import Groups
 from teds_provision.station.station import Station
 from teds_provision.station.store import connection, database, dump, lock, row_sample
 from teds_provision.station.store.audit import _linked
@@ -271,6 +272,52 @@ def test_a_home_that_cannot_be_opened_is_a_store_failure_with_its_cure(
         f"The store {store.path} has no identifier.", "Run teds-provision init."
     )  # fmt: skip
     assert closed == [store.path]
+
+
+def test_no_file_stays_open_after_a_look_or_a_failure(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A service that runs for months looks at locks a thousand times a day."""
+    home, group = store.home, Groups(store, store.home, cast("Any", None))
+
+    def fail() -> None:
+        with group.frozen("hand"):
+            raise KeyError
+
+    def busy() -> None:
+        with group.frozen("hand"), group.frozen("hand"):
+            pytest.fail("two hold one group")
+
+    def flushed() -> None:
+        with store.transaction(later=True):
+            store.execute("UPDATE meta SET value = value")
+        with monkeypatch.context() as patch:
+            patch.setattr(connection, "sync_content", full)
+            store.flush()
+
+    def held() -> None:
+        with StoreLock(home, command="x"):
+            assert lock.holder_of(home) is not None
+        assert lock.holder_of(home) is None
+
+    def looked() -> None:
+        with NodeLock(home, NODE):
+            assert NodeLock(home, NODE).is_taken
+
+    def unlockable() -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(lock, "lock", refused)
+            assert lock.holder_of(home) is None
+            patch.setattr(lock, "fcntl", SimpleNamespace(fcntl=refused, F_OFD_GETLK=0, F_WRLCK=0))
+            assert not NodeLock(home, NODE).is_taken
+
+    held()
+    looked()
+    before = len(os.listdir("/proc/self/fd"))
+    for act, error in ((fail, KeyError), (busy, FrozenError), (flushed, StoreError)):
+        with pytest.raises(error):
+            act()
+    for quiet in (held, looked, unlockable):
+        quiet()
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 # -- rows that this tool never wrote -----------------------------------------------------------------------------------
