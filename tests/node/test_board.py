@@ -358,6 +358,7 @@ def test_limits_of_a_falling_curve_are_the_same_raw_numbers_in_their_order() -> 
         ({0.0: 4095.0, 0.11: 0.0}, (-0.5, 4095.5)),
         ({0.0: 10.0, 0.11: math.inf}, (-math.inf, math.inf)),
         ({0.0: OverflowError(), 0.11: 5.0}, (-math.inf, math.inf)),
+        ({0.0: 5.0, 0.11: BadDataError("no inverse")}, (-math.inf, math.inf)),
     ):
         board.converters[1] = falling(raw)
         assert board._raw_limits(1) == bounds

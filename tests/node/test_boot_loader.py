@@ -214,6 +214,7 @@ def test_damaged_boot_state_is_named(folder: Path) -> None:
         "",
         "{}",
         "[]",
+        "7",
         whole.replace('"a"', '"c"'),
         whole.replace("false", "0"),
         whole.replace("/1", "/2"),
@@ -224,7 +225,7 @@ def test_damaged_boot_state_is_named(folder: Path) -> None:
     ):
         assert damaged != whole
         path.write_text(damaged)
-        with pytest.raises(BadDataError, match="boot state"):
+        with pytest.raises(BadDataError, match="is not the boot state of a virtual node, or it is damaged"):
             ImageSlots(folder)
 
 

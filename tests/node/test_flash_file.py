@@ -239,7 +239,8 @@ def test_what_was_committed_before_the_node_was_taken_is_what_runs(
 
 @pytest.mark.parametrize(
     "change",
-    [{"key": 7}, {"key": "xy"}, {"key": None}, {"flash": 7}, {"flash": []}, {"flash": None}, {"flash": {}},
+    [{"key": "00" * 32}, {"key": 7}, {"key": "xy"}, {"key": None}, {"flash": 7}, {"flash": []}, {"flash": None},
+     {"flash": {}},
      {"max_message": None}, {"max_message": "many"}, {"max_message": 0}, {"hardware": 7}, {"hardware": [[1, 3]]},
      {"hardware": [[1, 3, "xy"]]}, {"firmware": 7}, {"firmware": []}, {"firmware": {}}, {"format": "another"},
      {"name": ...}],

@@ -99,6 +99,22 @@ def test_files_are_read_once_a_period_and_lost_time_is_not_made_up_for(
     assert read == [("x", 1)] * 2
 
 
+def test_a_file_that_cannot_be_read_says_why_until_it_can(tmp_path: Path) -> None:
+    log: list[Any] = []
+    part: Any = SimpleNamespace(note_trouble=log.append, put=lambda _, raw: log.append(raw))
+    channel: Any = SimpleNamespace(file=tmp_path / "in_temp_raw")
+    made: Any = IioReader.__new__(IioReader)
+    made._read_file(channel, part)
+    (tmp_path / "in_temp_raw").write_text("hot\n")
+    made._read_file(channel, part)
+    (tmp_path / "in_temp_raw").write_text(" 23.5\n")
+    made._read_file(channel, part)
+    assert log == [
+        "in_temp_raw cannot be read: No such file or directory", "in_temp_raw cannot be read: it holds no number", "",
+        23.5,
+    ]  # fmt: skip
+
+
 class _Stop:
     def __init__(self, rounds: int) -> None:
         self.rounds, self.waits = rounds, list[float]()

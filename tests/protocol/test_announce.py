@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.protocol.announce import AddressClaim, Announce, uuid_crc
+from teds_provision.protocol.announce import AddressClaim, Announce, default_can_address, is_announce, uuid_crc
 
 
 def soon(low: float, high: float) -> float:
@@ -46,6 +46,18 @@ def test_no_frame_is_taken_for_an_announce_that_is_none(identifier: int, data: b
 )
 def test_other_frames_are_none(identifier: int, data: str) -> None:
     assert Announce.decode(identifier, bytes.fromhex(data)) is None
+
+
+def test_the_default_address_of_a_node_follows_from_its_uuid() -> None:
+    assert [default_can_address(uuid) for uuid in (b"123456789", bytes(10))] == [55, 21]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "is_one"),
+    [(0x1CFF0021, True), (0x1CFF00FF, True), (0x1CFF2021, False), (0x1CFE0021, False), (0x18DA21F1, False)],
+)
+def test_an_announce_is_known_by_its_identifier(identifier: int, is_one: bool) -> None:
+    assert is_announce(identifier) is is_one
 
 
 def test_the_first_announce_waits_up_to_half_a_second_and_leaves_once() -> None:

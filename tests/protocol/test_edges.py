@@ -37,11 +37,12 @@ from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.messages.message import compose_command, compose_service
 from teds_provision.protocol.messages.tables import describe_request
 from teds_provision.protocol.operation.can_frames import StreamAssembly
+from teds_provision.protocol.operation.datagram import DatagramSealer
 from teds_provision.protocol.plant.document import Fields
 from teds_provision.protocol.plant.evidence import CheckedEvidence, Signatures, check_signatures
 from teds_provision.protocol.plant.roster import _roles
 from teds_provision.protocol.plant.signing import require_name
-from teds_provision.protocol.session import unpad
+from teds_provision.protocol.session import _decrypt, unpad
 from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.teds.codec import security
 from tests.protocol.desk import CREDENTIALS, UUID
@@ -467,3 +468,30 @@ def test_roles_of_a_later_version_are_passed_over(roles: list[str], read: set[st
 def test_roles_are_words(roles: list[object]) -> None:
     with pytest.raises(BadDataError, match="roles is no list of words"):
         _roles(Fields({"roles": roles}, "It"))
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("2026-01-31T12:00:00Z", "2026-01-31T12:00:00Z"),
+        ("2026-01-31t14:00:00.5+02:00", "2026-01-31T12:00:00Z"),
+        ("0001-01-01T00:00:00+23:59", None),  # before the first year
+        ("9999-12-31T23:59:59-23:59", None),
+        ("2026-02-30T00:00:00Z", None),
+    ],
+)
+def test_a_time_of_a_document_is_one_of_the_years_1_to_9999(text: str, read: str | None) -> None:
+    members = strict_json.Members({"created": text}, "It")
+    if read is not None:
+        assert strict_json.time_text(members.time("created")) == read
+        return
+    with pytest.raises(BadDataError, match="created is no RFC 3339 time"):
+        members.time("created")
+
+
+@pytest.mark.parametrize(
+    "octets", [b"", b"\0\0\0", b"\0\0\0\1", b"\0\0\0\1" + bytes(7), b"\0\0\0\1" + bytes(40), bytes(70_000)]
+)
+def test_octets_that_hold_no_good_tag_open_nothing(octets: bytes) -> None:
+    assert DatagramSealer(bytes(16)).open(octets) is None
+    assert _decrypt(bytes(16), octets) is None

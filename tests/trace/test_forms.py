@@ -559,3 +559,9 @@ def test_octets_that_a_packet_says_and_lacks_are_named() -> None:
     assert refused.value.message == (
         f"The pcapng block at octet {len(head)} does not parse: 9 octets are said to be captured, 8 are there."
     )
+
+
+@pytest.mark.parametrize("block", [le_block(1, b""), le_block(6, le(0, 0, 0, 0)), le_block(6, le(9, 0, 0, 0, 0))])
+def test_a_block_that_is_too_short_or_of_no_interface_is_named(block: bytes) -> None:
+    with pytest.raises(BadDataError, match=r"^The pcapng block at octet \d+ does not parse"):
+        list(pcapng.read_pcapng(pcapng.head() + block))
