@@ -14,13 +14,15 @@ import pytest
 from teds_provision.errors import (
     BadDataError,
     LinkError,
+    NodeRefusedError,
     NotAuthenticError,
     NotFoundError,
     PolicyError,
     TedsProvisionError,
 )
-from teds_provision.plant import apply_pages, membership, parcels, removed_members
+from teds_provision.plant import apply_pages, evidence, membership, parcels, removed_members
 from teds_provision.plant.transport import Parcel
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord
@@ -235,6 +237,34 @@ def test_keys_are_reviewed_when_another_station_is_removed_and_each_hour(
         assert review(NOW, WEST, SOUTH) == first
     assert review(NOW, WEST) != first
     assert removed_members.last(opened) == review(NOW, WEST)
+
+
+@pytest.mark.parametrize(
+    "error", [LinkError("x"), NodeRefusedError("x", reason=1), NotAuthenticError("x"), SessionLostError(LinkError("x"))]
+)
+def test_of_a_board_that_is_gone_the_station_signs_alone(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    sealed = list[Any]()
+
+    def prove(*_: object) -> bytes:
+        raise error
+
+    def seal(key: object, signature: object, claim: Any, **more: Any) -> bytes:
+        sealed.append((key, signature, more))
+        return b"envelope"
+
+    monkeypatch.setattr(evidence, "prove_claim", prove)
+    monkeypatch.setattr(evidence, "seal", seal)
+    credentials = stub(key="key", station_signature="signature")
+    facts = stub(failure="no-node")
+    claim: Any = stub(facts=facts)
+    node: Any = None
+    assert evidence.sign_evidence(node, credentials, claim, operator="Eve", finished="then") == b"envelope"
+    without = {"nonce": b"", "proof": b"", "finished": "then", "operator": "Eve"}
+    assert sealed == [("key", "signature", without)]
+    facts.failure = None
+    with pytest.raises(type(error)):
+        evidence.sign_evidence(node, credentials, claim)
+    assert len(sealed) == 1, "a board that passed must answer"
 
 
 def test_an_alarm_and_a_roster_are_entries_with_whom_they_are_about(opened: Station, log: Log) -> None:

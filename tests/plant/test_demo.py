@@ -121,6 +121,29 @@ def test_a_server_that_does_not_start_is_reported_with_the_end_of_its_log(
     assert asked == [["/bin/pg_isready", "-q", "-h", str(tmp_path / "s"), "-p", "54321"]] * looks
 
 
+@pytest.mark.parametrize("fails", [True, False])
+def test_the_server_ends_with_its_block_however_that_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    done = list[str]()
+    for name in ("make", "start", "stop"):
+        monkeypatch.setattr(cluster.Cluster, name, lambda _, name=name: done.append(name))
+
+    def block() -> None:
+        with cluster.running(tmp_path, 54321, tmp_path) as made:
+            assert (made.folder, made.port, made.bin) == (tmp_path, 54321, tmp_path)
+            done.append("block")
+            if fails:
+                raise LinkError("A step failed.")
+
+    if fails:
+        with pytest.raises(LinkError):
+            block()
+    else:
+        block()
+    assert done == ["make", "start", "block", "stop"]
+
+
 def test_sql_of_the_demo_runs_as_the_superuser_and_a_failure_has_the_servers_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

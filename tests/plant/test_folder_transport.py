@@ -128,3 +128,15 @@ def test_a_stick_that_was_unplugged_is_not_made_again(transport: FolderTransport
     assert not stick.exists()
     assert (transport.heads(), list(transport.rosters()), list(transport.parcels(WEST))) == ({}, [], [])
     transport.close()
+
+
+def test_a_file_that_another_station_takes_away_meanwhile_is_none(
+    transport: FolderTransport, stick: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(stick / "large").write_bytes(bytes(164))
+    put(stick / "larger").write_bytes(bytes(165))
+    assert transport._read(stick / "large", 100) == bytes(164)
+    assert transport._read(stick / "larger", 100) is None
+    assert transport._read(stick / "gone", 100) is None
+    (stick / "link").symlink_to(stick / "large")
+    assert transport._read(stick / "link", 100) is None

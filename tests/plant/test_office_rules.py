@@ -432,6 +432,14 @@ def test_an_office_names_what_it_would_build_differently_up_to_five_places(
         built(lacking)
 
 
+def test_text_that_is_nested_too_deep_for_toml_is_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    def loads(_: str) -> Any:
+        raise RecursionError
+
+    monkeypatch.setattr(office.tomllib, "loads", loads)
+    assert _text_of(b"a = [[") == ("a = [[", "calibration.csv")
+
+
 def test_an_office_answers_in_turn_and_takes_away_what_it_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     """A request from the future stays, one of a removed station gets no answer, a foreign one is discarded."""
     notices, sent, gone = list[str](), list[tuple[str, bytes, str]](), list[str]()

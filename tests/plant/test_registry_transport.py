@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any, cast
@@ -210,3 +211,49 @@ def test_a_foreign_message_is_its_first_line_without_control_characters() -> Non
     assert postgres._words(error(None, "\n\n  first\x1b[31m  \nsecond")) == "first\N{REPLACEMENT CHARACTER}[31m"
     assert postgres._words(error(None, "x" * 301)) == "x" * 300
     assert postgres._words(error(None, "")) == "Error"
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_connection_is_cut_only_while_its_block_takes_longer(monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
+    timers, shut, ended = list[Any](), list[object](), threading.Event()
+
+    class Timer:
+        daemon = False
+
+        def __init__(self, seconds: float, cut: Callable[[], None]) -> None:
+            self.seconds, self.cut, self.log = seconds, cut, list[str]()
+            timers.append(self)
+
+        def start(self) -> None:
+            self.log.append(f"start, daemon {self.daemon}")
+
+        def cancel(self) -> None:
+            self.log.append("cancel")
+
+    def block() -> None:
+        with postgres._cut_after(connection, 2.5, ended):
+            if fails:
+                raise KeyError
+
+    connection: Any = object()
+    monkeypatch.setattr(postgres.threading, "Timer", Timer)
+    monkeypatch.setattr(postgres, "_shut", shut.append)
+    if fails:
+        with pytest.raises(KeyError):
+            block()
+    else:
+        block()
+    [timer] = timers
+    assert (timer.seconds, timer.log, ended.is_set(), shut) == (2.5, ["start, daemon True", "cancel"], False, [])
+    timer.cut()
+    assert (ended.is_set(), shut) == (True, [connection])
+
+
+@pytest.mark.parametrize("error", [OSError("It is closed."), psycopg.OperationalError("It is lost.")])
+def test_a_connection_that_is_gone_is_shut_without_a_word(error: Exception) -> None:
+    class Gone:
+        @property
+        def pgconn(self) -> Any:
+            raise error
+
+    postgres._shut(cast("Any", Gone()))

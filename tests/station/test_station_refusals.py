@@ -260,7 +260,8 @@ def test_when_this_process_started(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurements.os, "sysconf", {"SC_CLK_TCK": 100}.__getitem__)
     monkeypatch.setattr(measurements.time, "time", lambda: 99.9)
     assert measurements._process_start() == 1042
-    for stat, whole in ((STAT, "cpu 1 2\n"), (STAT, "btime\n"), ("41 (x) S 0", files["/proc/stat"]), ("", "btime x")):
+    for stat, whole in ((STAT, "cpu 1 2\n"), (STAT, "btime\n"), ("41 (x) S 0", files["/proc/stat"]), ("", "btime x"),
+                        (STAT, "btime x\n")):  # fmt: skip
         files.update({"/proc/self/stat": stat, "/proc/stat": whole})
         assert measurements._process_start() == 99, "now, if the system does not report it"
     monkeypatch.setattr(Path, "read_text", raises(FileNotFoundError(errno.ENOENT, "no /proc")))

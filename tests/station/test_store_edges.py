@@ -9,6 +9,7 @@ import json
 import os
 import sqlite3
 import tempfile
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -113,6 +114,61 @@ def test_a_transaction_that_cannot_begin_leaves_the_store_as_durable_as_before(
     assert store._is_to_wait(cast("Any", SimpleNamespace(sqlite_errorcode=sqlite3.SQLITE_BUSY)))
 
 
+@pytest.mark.parametrize("way", ["execute", "change", "execute_many"])
+@pytest.mark.parametrize("waited", [False, True])
+def test_no_foreign_error_comes_out_of_a_statement(
+    store: Store, monkeypatch: pytest.MonkeyPatch, way: str, waited: bool
+) -> None:
+    busy = sqlite3.OperationalError("database is locked")
+    monkeypatch.setattr(store, "_is_to_wait", lambda error: error is busy)
+    cases: list[tuple[Exception, type[Exception], str]] = [
+        (sqlite3.DatabaseError("malformed"), StoreError, "cannot be used: SQLite says: malformed."),
+        (OSError(errno.ENOSPC, "full"), StoreError, NO_ROOM),
+        (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates"), BadDataError, "not valid UTF-8"),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid"), StoreError, "it is damaged"),
+    ]
+    for error, kind, message in cases:
+        raised = iter([busy, error] if waited and way != "execute_many" else [error])
+
+        def fail(*_: Any, raised: Any = raised) -> Any:
+            raise next(raised)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(store, "_cursor", SimpleNamespace(execute=fail))
+            if way == "execute_many":
+                real = store._connection
+                patch.setattr(store, "_cursor", real.cursor())
+                patch.setattr(store, "_connection", SimpleNamespace(
+                    executemany=fail, execute=real.execute, total_changes=0, in_transaction=True))  # fmt: skip
+            words = ("DELETE FROM meta WHERE name = ?", [("x",)]) if way == "execute_many" else ("DELETE FROM meta",)
+            with pytest.raises(kind, match=message):
+                getattr(store, way)(*words)
+        assert next(raised, None) is None
+
+
+def test_after_a_block_other_threads_use_the_store(store: Store) -> None:
+    free = list[bool]()
+
+    def look() -> None:
+        taken = store._lock.acquire(blocking=False)
+        free.append(taken)
+        if taken:
+            store._lock.release()
+
+    def other() -> None:
+        thread = threading.Thread(target=look)
+        thread.start()
+        thread.join()
+
+    for fails in (False, True):
+        with contextlib.suppress(KeyError), store.transaction():
+            other()
+            if fails:
+                raise KeyError
+        other()
+    assert free == [False, True] * 2
+
+
 # -- a store that cannot be written ------------------------------------------------------------------------------------
 
 
@@ -142,10 +198,15 @@ def test_of_a_store_that_can_only_be_read_everything_is_read_and_nothing_changed
             with pytest.raises(StoreError) as error:
                 change()
             assert error.value is why
-    monkeypatch.setattr(database, "open_copy", full)
-    with pytest.raises(StoreError) as error:
-        Store.open(store.home)
-    assert error.value is why, "not what the copy lacks"
+
+    def damaged(*_: Any) -> Any:
+        raise sqlite3.DatabaseError("malformed")
+
+    for failing in (full, damaged):
+        monkeypatch.setattr(database, "open_copy", failing)
+        with pytest.raises(StoreError) as error:
+            Store.open(store.home)
+        assert error.value is why, "not what the copy lacks"
     why.__cause__ = OSError(errno.EIO, "Input/output error")
     monkeypatch.undo()
     monkeypatch.setattr(Database, "_opened", classmethod(unwritable))
