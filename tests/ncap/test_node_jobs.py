@@ -136,6 +136,7 @@ def test_who_asked_hears_why_the_session_was_lost_or_what_the_work_refused(
         wait_for = jobs.wait_for
 
         def tapped_at_once(*request: Any, wait_for: Any = wait_for) -> NodeJob[Any]:
+            assert not on_a_bus, "on a bus nobody is waited for"
             job = wait_for(*request)
             jobs.serve(node)
             return cast("NodeJob[Any]", job)

@@ -436,3 +436,27 @@ def test_things_have_the_address_under_which_they_were_asked_for_and_none_over_t
     assert asked == [(daemon, base)]
     assert answer.body.decode() == '[{"title": "Ä"}]'
     assert answer.headers["content-type"].startswith("application/ld+json")
+
+
+@pytest.mark.parametrize(
+    ("given", "media", "body"),
+    [
+        ({}, "application/xml", "xml"),
+        ({"format": "1"}, "application/xml", "xml"),
+        ({"format": "0"}, "text/plain", "1\nÄ<\n"),
+        ({"format": "2"}, "application/xml", "xml"),
+        ({"format": "0", "responseformat": "XML"}, "application/xml", "xml"),
+        ({"responseformat": "Json"}, "application/json", '{"timId":1,"name":"Ä<"}'),
+    ],
+)
+def test_an_answer_of_clause_12_is_in_the_form_that_was_asked_for_and_whole_xml_without_one(
+    given: dict[str, str], media: str, body: str
+) -> None:
+    answer = clause12._shown("ReadTeds", {"timId": 1, "name": "Ä<"}, given)
+    assert answer.media_type == media
+    if body == "xml":
+        body = (
+            "<?xml version='1.0' encoding='utf-8'?>\n"
+            "<ReadTedsHTTPResponse><timId>1</timId><name>Ä&lt;</name></ReadTedsHTTPResponse>"
+        )
+    assert bytes(answer.body).decode() == body

@@ -1134,3 +1134,28 @@ def test_what_is_due_for_a_measurement_in_each_phase(
     assert done == course
     assert running.again is more.get("others", False)
     assert running.looked == (100.0 if "waiting silent" in course else more.get("looked", 0.0))
+
+
+def test_a_node_of_another_measurement_is_refused_with_the_remedy(service: Service) -> None:
+    listed(service, NODE).phase = Phase.MEASURING
+    service.measurements._require_unmeasured(bytes.fromhex(OTHER))
+    with pytest.raises(NodeBusyError) as busy:
+        service.measurements._require_unmeasured(bytes.fromhex(NODE))
+    assert busy.value.message == f"Node {NODE} is already being measured (1)."
+    assert busy.value.hint == "End the measurement first."
+    service.measurements._running["1"].phase = Phase.OVER
+
+
+def test_a_node_that_another_part_works_with_is_considered_again_a_tenth_of_a_second_later(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = open_to(service, monkeypatch)
+    running.phase = Phase.MEASURING
+    running.membership.elsewhere.add(NODE)
+    service.locks.acquire(NODE, "it is looked at")
+    monkeypatch.setattr(measurement_supervisor, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    service.measurements._consider(running, NODE)
+    assert running.membership.busy == {NODE: pytest.approx(100.1)}
+    assert running.membership.elsewhere == set()
+    assert service.locks.holder(NODE) == "it is looked at"
+    running.phase = Phase.OVER

@@ -487,6 +487,25 @@ def test_on_a_bus_that_works_who_does_not_answer_is_gone_unless_another_part_wor
     ]  # fmt: skip
 
 
+def test_a_node_that_left_before_its_turn_is_looked_at_when_it_is_back(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served, taken = list[str](), list[Any]()
+    watch._for_strangers = SimpleNamespace(submit=lambda work, contact: taken.append((work, contact)))  # type: ignore[assignment]
+    monkeypatch.setattr(watch, "_serve", lambda contact: served.append(contact.identity.uuid.hex()))
+    item = sighting(1)
+    uuid = item.uuid.hex()
+    watch.on_sighting(item)
+    assert watch._pending == {uuid}
+    watch._gone(uuid)
+    (work, contact), *_ = taken
+    work(contact)
+    assert (served, watch._pending) == ([], set())
+    watch.on_sighting(sighting(1))
+    work(contact)
+    assert (served, len(taken)) == ([uuid], 2)
+
+
 def test_a_bug_on_a_link_is_shown_and_logged_and_the_link_is_opened_again(
     watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

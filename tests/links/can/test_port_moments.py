@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflictError, NoNodeError
+from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
 from teds_provision.links.can import identify_broadcast
 from teds_provision.links.can import port as of_port
 from teds_provision.links.can.identify_broadcast import FunctionalAnswers
@@ -243,3 +243,46 @@ def test_a_conflict_that_is_not_seen_again_is_none(port: MockPort) -> None:
     assert port.lists() == ([], [7])
     assert len(port.asked) == 2
     assert port.kinds() == []
+
+
+def test_a_watched_bus_that_is_lost_is_named_once_listened_to_anew_and_said_to_be_back(
+    port: MockPort, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone, course = LinkError("It is gone."), list[Any]()
+    rounds: list[Any] = [[(5, who(5))], gone, gone, [], [(6, who(6))], gone, [(7, who(7))], []]
+
+    class MockArrivals:
+        def __init__(self, watched: object, _notice: object) -> None:
+            assert watched is port
+
+        def round(self, _stop: object) -> Iterator[Any]:
+            step = rounds.pop(0)
+            if isinstance(step, LinkError):
+                raise step
+            yield from step
+
+        def lost(self) -> None:
+            course.append("lost")
+
+        def pause(self, _stop: object) -> None:
+            course.append("pause")
+
+        def pressed(self) -> list[bytes]:
+            return [who(8).uuid] if len(rounds) == 4 else []
+
+    def wait(seconds: float) -> None:
+        course.append(seconds)
+
+    stop: Any = SimpleNamespace(is_set=lambda: not rounds, wait=wait)
+    monkeypatch.setattr(of_port, "Arrivals", MockArrivals)
+    for contact in port.watch(stop=stop, notice=port.note):
+        course.append(contact.address)
+    assert course == [5, "pause", "lost", 1.0, "lost", 1.0, "pause", 6, "pause", "lost", 1.0, 7, "pause", "pause"]
+    assert port.notices == [
+        ("waiting", "Watching virtual:mock for nodes."),
+        ("reader-lost", "It is gone. Waiting for it."),
+        ("reader-ready", "The bus virtual:mock is back."),
+        ("pressed", f"Node {who(8).uuid.hex()} says it was pressed."),
+        ("reader-lost", "It is gone. Waiting for it."),
+        ("reader-ready", "The bus virtual:mock is back."),
+    ]

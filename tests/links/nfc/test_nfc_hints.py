@@ -59,6 +59,26 @@ def test_states(records: list[tuple[str, str]], state: str, percent: int | None,
 
 
 @pytest.mark.parametrize(
+    ("octets", "fields"),
+    [
+        ("0F7F FF 4B C0 10", {"counter": 7, "error": 0, "power_wanted": 1, "information_wanted": 1, "power_step": -1,
+                              "driver": 3, "battery_percent": 75, "hold_off_ms": 30}),
+        ("08 00 01 64 3F 03", {"counter": 0, "error": 0, "power_wanted": 0, "information_wanted": 0, "power_step": 1,
+                               "driver": 0, "battery_percent": 100, "hold_off_ms": 6}),
+        ("91 80 7F 65 00 02", {"counter": 1, "error": 1, "power_wanted": 0, "information_wanted": 0, "power_step": 127,
+                               "driver": 0, "protocol_error": 1, "temperature_error": 0}),
+        ("8E 40 80 00 40 01", {"counter": 6, "error": 1, "power_wanted": 1, "information_wanted": 0,
+                               "power_step": -128, "driver": 1, "battery_percent": 0, "protocol_error": 0,
+                               "temperature_error": 1}),
+    ],
+)  # fmt: skip
+def test_the_fields_of_a_control_record(octets: str, fields: dict[str, int]) -> None:
+    found = hints.control(bytes.fromhex(octets))
+    assert {name: value for name, value in found.items() if name != "duration_ms"} == fields
+    assert hints.control(bytes.fromhex(octets)[:5]) == {}
+
+
+@pytest.mark.parametrize(
     ("found", "text"),
     [
         (Charging("wanted", 80, 24), "battery 80 %, 24 °C, charging wanted"),

@@ -260,6 +260,9 @@ def test_what_is_said_if_the_node_did_not_come(
     with pytest.raises(error) as failure:
         scene.port.find(is_wanted, seconds=2, notice=scene.note, address=0x21)
     assert failure.value.message == text
+    assert failure.value.hint != ""
+    if error is NoReaderError:
+        assert failure.value.hint == "Plug it in again."
     assert 2.0 <= scene.now - 100 < 3.1
 
 
