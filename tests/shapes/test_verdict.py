@@ -45,6 +45,7 @@ def test_a_verdict_has_the_same_members_as_object_json_and_description() -> None
         set(VERDICT.to_json()) == set(schema("Verdict")["required"]) == set(schema("Verdict")["properties"]) == members
     )
     assert members <= set(get_type_hints(answers.Sheet)), "a datasheet comes with its verdict"
+    assert VERDICT.reading() == {"from": "session", "at": "2026-11-27T12:00:00Z", "by": "verify"}
     assert VERDICT.reading().items() <= VERDICT.to_json().items()
     assert schema("Verdict")["properties"]["verdict"]["enum"] == list(get_args(VerdictWord))
 

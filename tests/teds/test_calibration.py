@@ -684,6 +684,13 @@ def test_a_curve_that_leaves_the_numbers_is_not_inverted() -> None:
         PreparedInverse(PreparedCurve(steep), 0.0, 65535.0)(np.array([1.0]))
 
 
+def test_the_way_back_over_a_step_is_to_the_nearer_of_its_two_results() -> None:
+    steps = PreparedInverse(PreparedCurve(fit([(0, 0.0), (10, 10.0)], "steps", channel=1)), 0.0, 19.0)
+    below, above = steps(np.array([4.0, 6.0])).tolist()
+    assert below == pytest.approx(10.0)
+    assert below < 10.0 <= above
+
+
 def test_the_kind_of_a_curve_in_words() -> None:
     for points, method, words in (
         (2, "table", "table of 1 segment"),

@@ -598,6 +598,26 @@ def test_a_certificate_is_shown_whole() -> None:
     assert int(rows[-1][1].removesuffix(" more")) + len(rows) - 1 == 51
 
 
+def test_what_a_certificate_does_not_state_leaves_no_gap_in_what_is_shown() -> None:
+    bare = re.sub(r"<dcc:model>.*?</dcc:model>", "", TEXT)
+    bare = re.sub(r"<dcc:manufacturer>.*?</dcc:manufacturer>", "", bare, flags=re.DOTALL)
+    bare = re.sub(r"\s*<dcc:issueDate>.*?</dcc:issueDate>", "", bare)
+    shown = dict(ShownCertificate.from_certificate(read_certificate(bare.encode(), "c.xml")).lines())
+    assert shown["device"] == "magnetic angle sensor, S-1007 (manufacturer)"
+    assert shown["calibrated"] == "2026-10-12"
+
+
+def test_the_notes_of_a_read_certificate_are_its_warnings_and_what_was_not_checked() -> None:
+    old = TEXT.replace('schemaVersion="3.2.1"', 'schemaVersion="3.1.9"').encode()
+    certificate = read_certified(old, "c.xml", angle())[1].certificate
+    assert certificate is not None
+    assert certificate.notes == (
+        "The certificate is of DCC 3.1.9; only 3.2 and 3.3 were tried.",
+        "The certificate has no signature.",
+    )
+    assert certificate.signature == "not checked"
+
+
 def test_a_device_is_shown_with_its_serial_number_as_data() -> None:
     for issuer, serial in (("manufacturer", "S-1007"), ("customer", None)):
         octets = changed(ANGLE, ("<dcc:issuer>manufacturer<", f"<dcc:issuer>{issuer}<"))

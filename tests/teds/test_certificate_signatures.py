@@ -16,6 +16,7 @@ from teds_provision.errors import BadDataError, NotAuthenticError
 from teds_provision.teds.dcc import signature
 from teds_provision.teds.dcc.read import DigitalCertificate
 from teds_provision.teds.dcc.signature import read_checked
+from teds_provision.teds.dcc.xml_tree import Node
 
 from .certificates import ANGLE, changed, signer, signer_under_ca
 
@@ -244,6 +245,24 @@ def test_a_time_of_signing_that_is_none_saves_no_expired_signer(stated: str, usa
     forged = octets.replace(given, stated.format(within).encode())
     with pytest.raises(NotAuthenticError, match="is bad" if usable else "not valid any more, or not yet"):
         read(forged, gone.certificate)
+
+
+@pytest.mark.parametrize(
+    ("stated", "moment"),
+    [
+        ("1970-01-01T00:00:00", datetime(1970, 1, 1, tzinfo=UTC)),
+        ("8999-12-31T23:59:59Z", datetime(8999, 12, 31, 23, 59, 59, tzinfo=UTC)),
+        ("2026-01-01T12:00:00+02:00", datetime(2026, 1, 1, 10, tzinfo=UTC)),
+        (" 2026-01-01T12:00:00-01:30 ", datetime(2026, 1, 1, 13, 30, tzinfo=UTC)),
+        ("1969-12-31T23:59:59Z", None),
+        ("9000-01-01T00:00:00Z", None),
+    ],
+)
+def test_a_stated_time_of_signing_is_one_of_the_years_1970_to_8999(stated: str, moment: datetime | None) -> None:
+    octets = signer().sign(ANGLE)
+    octets = re.sub(rb"(?<=SigningTime>)[^<]+(?=<)", stated.encode(), octets)
+    (node,) = Node(etree.fromstring(octets), "c").children_named("ds:Signature")
+    assert signature._stated_time(node) == moment
 
 
 @pytest.mark.parametrize(

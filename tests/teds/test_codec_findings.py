@@ -390,4 +390,7 @@ def test_beyond_the_most_findings_only_what_decides_the_verdict_is_noted(monkeyp
     misplaced = bytes.fromhex("030400030101") + bytes.fromhex("280100") * 4
     found = teds.decode(misplaced)
     assert [f.code for f in found.findings if f.severity == "error"] == ["top-level", "top-level"]
+    assert sum(f.severity != "error" for f in found.findings) == 2, "and as many warnings and notes"
+    mixed = teds.decode(misplaced + bytes.fromhex("2800") * 3 + bytes.fromhex("9600") * 5)
+    assert [f.severity == "error" for f in mixed.findings].count(False) == 2, "however many errors are left out"
     assert "not-closed" in {f.code for f in teds.decode(misplaced + b"\x28\x09").findings}

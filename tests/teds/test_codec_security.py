@@ -81,6 +81,14 @@ def test_white_space_about_a_key_and_headers_of_a_pem_are_no_part_of_it() -> Non
     assert teds.read_key(first + b"\nComment: mine\nX-Y: 1\n\n" + rest) == teds.read_key(PEM)
 
 
+@pytest.mark.parametrize(
+    "octets", [b"\2" + POINT[1:], b"\3" + POINT[1:33], POINT[:-1], POINT + b"\0", SPKI[:-1], SPKI[1:]]
+)
+def test_a_key_is_an_uncompressed_point_of_p_256_alone(octets: bytes) -> None:
+    assert teds.read_key(octets).point is None
+    assert teds.read_key(POINT).point == teds.read_key(SPKI).point == POINT
+
+
 @pytest.mark.parametrize(("written", "form"), [("AAAAAAA=", "base64"), ("QUJDRA==", "base64"), ("QUJD", "raw")])
 def test_a_short_word_is_octets_and_no_base64(written: str, form: str) -> None:
     assert teds.read_key(written).form == form

@@ -329,6 +329,19 @@ def test_what_is_not_stated_is_skipped_unless_something_else_is_short() -> None:
     assert only("angle >= 360 deg", angle(), late).result == "passed", "only an uncertainty ends with its calibration"
 
 
+def test_a_difference_of_temperatures_is_shown_without_the_zero_of_the_unit() -> None:
+    celsius = load_profile("temperature-sensor")
+    line = replace(fit([(0, -40.0), (21120, 125.0)], "linear", channel=1), unit=parse_unit("degC"), uncertainty=0.5)
+    sheet = Sheet.from_image(Image(bytes(10), celsius.build(bytes(10), calibration={1: line}).blocks))
+    for asked, why in (
+        ("uncertainty <= 0.25 K", "uncertainty is 0.5 °C, asked is <= 0.25 K."),
+        ("uncertainty <= 0.25 degC", "uncertainty is 0.5 °C, asked is <= 0.25 degC."),
+        ("range >= 200 K", "range is 165 °C, asked is >= 200 K."),
+        ("high >= 400 K", "high is 125 °C, asked is >= 400 K."),
+    ):
+        assert (only(asked, sheet).result, only(asked, sheet).why) == ("failed", why)
+
+
 def test_which_channels_count_and_how_many_have_to_meet_it() -> None:
     asked = parse_fits("rate >= 1 Hz")
     good, bad = Fit(1, "a", "passed", ""), Fit(2, "b", "failed", "")

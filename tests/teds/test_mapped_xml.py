@@ -138,6 +138,16 @@ def test_what_is_no_xml_or_in_an_unknown_encoding_is_refused(octets: bytes) -> N
         profile_from_xml(octets, MAP, name="lab")
 
 
+def test_a_text_of_the_xml_has_at_most_200_characters() -> None:
+    for letters in (200, 201):
+        xml = f"<d><c><n>{'x' * 100}<b>{'y' * (letters - 100)}</b></n></c></d>".encode()
+        if letters == 200:
+            assert f'name = "{"x" * 100}{"y" * 100}"' in profile_from_xml(xml, MAP, name="lab")
+        else:
+            with pytest.raises(BadDataError, match=r"^The text at 'n' has more than 200 characters\.$"):
+                profile_from_xml(xml, MAP, name="lab")
+
+
 @pytest.mark.parametrize(
     ("mapping", "hint"),
     [

@@ -528,6 +528,11 @@ def test_a_mistake_in_an_added_table_is_named(extra: str, field: str, tmp_path: 
     assert all(problem.where.line > at for problem in problems if problem.severity == "error")
 
 
+def test_both_the_octets_and_the_bits_of_a_sample_are_judged(tmp_path: Path) -> None:
+    _, problems = check(write(tmp_path, "force", GOOD.replace("octets = 2, bits = 12", "octets = 9, bits = 73")))
+    assert [problem.field for problem in problems] == ["channel.1.sample.octets", "channel.1.sample.bits"]
+
+
 def test_all_mistakes_are_found_at_once(tmp_path: Path) -> None:
     text = GOOD.replace('"N"', '"newtn"').replace('"sensor"', '"x"').replace("[meta]", "[meta]\nfoo = 1")
     path = write(tmp_path, "force", text)

@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 from teds_provision import teds
+from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.formats.profileform import read_profile, spell, write_profile
 from teds_provision.teds.image import TedsBlock
 from teds_provision.teds.profile import load_profile
@@ -228,3 +229,14 @@ def test_any_character_of_a_name_is_written_as_toml_reads_it() -> None:
     spelt = 'name = "a\\"b\\\\c\\n\\r\\t\\u0000\\u001f\\u007f\x80ä"'
     assert spelt in text.split("\n")
     assert tomllib.loads(spelt) == {"name": name}
+
+
+def test_of_a_field_that_is_there_twice_the_first_is_written_and_none_that_is_no_number() -> None:
+    twice = frame(bytes.fromhex("030400030101 0d043f800000 0d0440000000 0e047f800000"))
+    angles = frame(bytes.fromhex("030400030101 26087fc000003f800000"))
+    text, _ = write_profile([TedsBlock(1, 3, twice), TedsBlock(2, 3, angles)])
+    assert [line for line in text.splitlines() if line.startswith(("low-", "high-", "direction"))] == [
+        "low-limit = 1.0"
+    ]
+    good = frame(bytes.fromhex("030400030101 2608000000003f800000"))
+    assert "direction-angles = [0.0, 1.0]" in write_profile([TedsBlock(1, 3, good)])[0].splitlines()

@@ -128,6 +128,15 @@ def test_contradictions_between_teds_are_found() -> None:
     assert (0, "channels") in {(finding.channel, finding.code) for finding in Sheet.from_blocks(blocks).findings}
 
 
+def test_the_vectors_of_a_node_are_its_vector_groups_alone() -> None:
+    groups = [
+        ("CGroup", {"GrpType": 1, "MemList": [1, 2]}),
+        *(("VGroup", {"GrpType": 1, "MemList": m}) for m in ([3, 1], [2])),
+    ]
+    meta = teds.compose(1, [("UUID", UUID), *groups])
+    assert Sheet.from_blocks({(0, AccessCode.META): meta}).meta.vectors == ((3, 1), (2,))
+
+
 def test_the_channels_that_are_counted_are_those_that_are_described() -> None:
     image = image_of("magnetic-angular-position-sensor")
     for stated, message in (

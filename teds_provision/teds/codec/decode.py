@@ -41,7 +41,7 @@ class Head:
         self.octets = octets
         self.framed = framed
         self.findings: list[Finding] = []
-        self.errors = 0
+        self.errors = self.others = 0
         self.edition: Edition | None = None
         self.access_code: int | None = None
         self.table: Table | None = None
@@ -65,8 +65,10 @@ class Head:
             self.errors += 1
             if self.errors > MAX_FINDINGS and code not in MALFORMED_CODES:
                 return
-        elif len(self.findings) - self.errors >= MAX_FINDINGS:
-            return
+        else:
+            self.others += 1
+            if self.others > MAX_FINDINGS:
+                return
         self.findings.append(Finding(severity, code, message, offset, field, str(asked), str(found)))
 
     def frame(self) -> tuple[int, int]:
