@@ -260,6 +260,12 @@ def test_all_are_found_once_no_new_one_has_come_for_a_while_and_each_is_disconne
     assert {kind for kind, _ in port.notices} == {"waiting"}
 
 
+def test_all_are_in_the_order_of_their_addresses_whoever_came_first(port: MockPort) -> None:
+    port.heard = {TWO: 0.0, ONE: 12.0}
+    assert everyone(port, listen=15.0) == [1, 2]
+    assert [address for _, address in port.asked] == [TWO, ONE]
+
+
 def test_nobody_who_advertises_is_said_with_the_remedy(port: MockPort) -> None:
     with pytest.raises(NoNodeError) as none:
         everyone(port, 5.0)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import GarbledError, LinkError, MessageTooLongError, NodeSilentError
+from teds_provision.errors import AddressConflictError, GarbledError, LinkError, MessageTooLongError, NodeSilentError
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.bus_multiplexer import AddressPair, ReplyEvent
 from teds_provision.links.can.isotp import Frame
@@ -263,3 +263,24 @@ def test_an_address_at_which_nobody_identifies_itself_well_has_no_identity(
     assert (found and found.uuid) == uuid
     assert len(bus.sent) == 1, "asked once"
     assert bus.now - 100 <= 1.0
+
+
+def test_a_reply_under_an_address_in_conflict_is_nobodys(bus: MockBus) -> None:
+    """Two nodes answer there: which of them gave the reply is unknown."""
+    bus.node = lambda _frame: [(0.1, "whole", b"\7" + REPLY)]
+    assert bus.exchange(SHORT) == REPLY
+    bus.has_conflict = lambda node: node == 0x21  # type: ignore[method-assign]
+    with pytest.raises(AddressConflictError, match="Two nodes answer at CAN address 0x21"):
+        bus.exchange(SHORT)
+
+
+@pytest.mark.parametrize(("seen", "failed", "named"), [(True, False, True), (True, True, False), (False, False, False)])
+def test_a_silent_node_may_be_due_to_another_station_of_our_address_unless_the_bus_failed(
+    bus: MockBus, seen: bool, failed: bool, named: bool
+) -> None:
+    bus.conflicts = SimpleNamespace(seen_within=lambda: seen, text="Another station uses 0xF1.", hint="Use another.")
+    bus.failed = failed
+    with pytest.raises(NodeSilentError) as silent:
+        bus.exchange(SHORT)
+    assert silent.value.message.endswith(" Another station uses 0xF1.") is named
+    assert (silent.value.hint == "Use another.") is named
