@@ -19,7 +19,7 @@ from teds_provision.plant.jobs import close_job, job_id, read_job, require_open,
 from teds_provision.plant.line import LineRun, LineUnit, Scans, _firmware_in_session
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.firmware import FirmwareReport
-from teds_provision.protocol.plant.evidence import EvidenceClaim
+from teds_provision.protocol.plant.evidence import BoardFacts, EvidenceClaim
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import RemovedMember
 from teds_provision.provisioning.board_type import WrongBoardError
@@ -342,6 +342,37 @@ def test_a_board_of_a_job_counts_and_gets_its_label_if_it_passed_with_evidence_o
         assert kept == [steps if passed else (*steps, ("verdict", "not-authentic", 0))]
     else:
         assert (kept, run.passed) == ([], int(passed))
+
+
+@pytest.mark.parametrize("of_a_job", [True, False])
+def test_the_facts_of_a_board_are_those_of_its_job_else_of_its_datasheet(
+    owner: Station, monkeypatch: pytest.MonkeyPatch, of_a_job: bool
+) -> None:
+    """The profile is the one that the job demanded, whatever the station knows of the board."""
+    owner.nodes.remember(A, profile="known-before")
+    run = LineRun(owner, job(owner) if of_a_job else None)
+    unit, kept = allotted(run), list[BoardFacts]()
+    shown = SimpleNamespace(key_epoch=3, sequence=9, signed_blocks={})
+    for name, value in {
+        "security.decode": lambda _teds: shown,
+        "blocks_of": lambda _shown: (),
+        "profile_files_digest": lambda _station, record: f"of {record.profile}",
+        "_firmware_in_session": lambda _node: ("a", "1.0.0", "", 1),
+        "sign_evidence": lambda _node, _credentials, claim, **_more: kept.append(claim.facts) or b"document",
+    }.items():
+        monkeypatch.setattr(f"teds_provision.plant.line.{name}", value)
+    monkeypatch.setattr(run, "keep", lambda *_words: None)
+    monkeypatch.setattr(run, "calibration_digest", lambda uuid: "cd" * 32 if uuid == A else None)
+    unit._keep(cast("Conversation", None), A, b"teds", (("write", "done", 5),), None)
+    [facts] = kept
+    of_no_job = (None, None, "known-before", "of known-before")
+    wanted = of_no_job if run.job is None else (run.job.id, 1, run.job.profile, run.job.profile_sha256)
+    assert (facts.job, facts.unit, facts.profile, facts.profile_sha256) == wanted
+    assert facts.profile != "known-before" or not of_a_job
+    assert (facts.attempt, facts.epoch, facts.sequence, facts.steps) == (1, 3, 9, (("write", "done", 5),))
+    assert (facts.calibration_sha256, facts.assurance, facts.firmware) == ("cd" * 32, "tap", ("a", "1.0.0", "", 1))
+    assert facts.heads is not None
+    assert (facts.certificates, facts.origin) == ((), None)
 
 
 def test_a_station_asks_no_office_if_it_is_the_office_itself_or_the_job_has_none(owner: Station) -> None:
