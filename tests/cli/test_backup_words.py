@@ -129,3 +129,24 @@ def test_a_merge_restores_what_the_person_was_asked_about_or_nothing(
     if code:
         assert done.json["error"]["message"].endswith("so the list is out of date. Nothing was changed.")
         assert done.json["error"]["hint"].endswith("Run it again and check the new list.")
+
+
+def test_a_merge_lists_all_that_comes_back_and_all_that_stays(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content: Any = SimpleNamespace(
+        name="north", created="2026-11-21T18:37:10Z", station="ab" * 32, age_days=lambda: 3, close=lambda: None
+    )
+    back = {"whitelist entries": 1, "names": 12}
+    plan = RestoreResult("merged", Relation.OLDER, back, ("the newer key of thumb",), "file")
+    monkeypatch.setattr(commands, "merge", lambda *_, **__: plan)
+    notes: list[str] = []
+    results: list[Any] = []
+    app: Any = SimpleNamespace(home=home, note=notes.append, emit=lambda result, _human: results.append(result))
+    station: Any = SimpleNamespace(identity=SimpleNamespace(record=lambda: SimpleNamespace(keystore="file")))
+    commands._merge(app, station, content, None, yes=False, dry_run=True)
+    assert notes[0].splitlines()[3:] == [
+        f"It is {Relation.OLDER.value} of this station.",
+        "  restored: whitelist entries: 1",
+        "  restored: names: 12",
+        "  unchanged: the newer key of thumb",
+    ]
+    assert (results[0]["back"], results[0]["kept"], results[0]["dry_run"]) == (back, ["the newer key of thumb"], True)

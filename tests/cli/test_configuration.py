@@ -465,3 +465,14 @@ def test_a_link_to_a_file_that_is_gone_is_no_missing_file(home: Path) -> None:
     (home / "config.toml").symlink_to(home / "gone.toml")
     refused = call(home, "--json", "nodes")
     assert (refused.code, refused.json["error"]["message"]) == (8, f"There is no file {home / 'config.toml'}.")
+
+
+@pytest.mark.parametrize(("value", "count"), [('["5"]', 1), ("[5, 6]", 2), ("[]", 0)])
+def test_a_list_is_no_value_of_an_option_that_takes_one(home: Path, value: str, count: int) -> None:
+    (home / "config.toml").write_text(f"[log]\nlast = {value}\n")
+    error = call(home, "--json", "config", "show").json["error"]
+    assert (error["code"], error["message"], error["hint"]) == (
+        "bad-data",
+        f"{home / 'config.toml'}: log.last takes one value, not {count}.",
+        "Fix that line.",
+    )

@@ -74,3 +74,12 @@ def test_no_word_is_lost_or_broken(words: list[str]) -> None:
         lines = folded(" ".join(words), stream).splitlines()
     assert " ".join(lines).split() == " ".join(words).split()
     assert all(len(line) <= COLUMNS for line in lines)
+
+
+def test_of_two_commands_in_a_line_the_first_begins_the_part_that_stays_whole() -> None:
+    text = "  → Say it anew: teds-provision log --why 'as in: teds-provision nodes' --since yesterday"
+    with terminal(40) as stream:
+        assert folded(text, stream).splitlines() == [
+            "  → Say it anew:",
+            "    teds-provision log --why 'as in: teds-provision nodes' --since yesterday",
+        ]

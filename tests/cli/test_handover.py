@@ -871,3 +871,23 @@ def test_a_move_is_undone_as_it_is_once_the_store_is_taken(monkeypatch: pytest.M
             "1 node back on this station; each key is rotated at the next contact.",
         ),
     ]
+
+
+def test_an_import_is_made_as_it_was_shown_or_was_made_before() -> None:
+    def planned(*nodes: str) -> Any:
+        return SimpleNamespace(nodes=list(nodes))
+
+    before = handover.ImportResult.__new__(handover.ImportResult)
+    for plan, shown, fine in (
+        (planned("a"), planned("a"), True),
+        (planned("a"), planned("b"), False),
+        (planned("a"), planned("a", "b"), False),
+        (before, planned("a"), True),
+        (before, before, True),
+        (planned("a"), before, False),
+    ):
+        if fine:
+            handover.require_as_shown(plan, shown)
+        else:
+            with pytest.raises(PolicyError, match="Another command changed the plan"):
+                handover.require_as_shown(plan, shown)

@@ -138,7 +138,12 @@ def test_a_topic_belongs_to_one_channel(desk: Path) -> None:
 
 @pytest.mark.parametrize(
     ("verdict", "name", "unverified"),
-    [("authentic", "cell of the arm", False), ("unsigned", "thumb", True), (None, "cell of the arm", False)],
+    [
+        ("authentic", "cell of the arm", False),
+        ("unsigned", "thumb", True),
+        ("not authentic", "cell of the arm", False),
+        (None, "cell of the arm", False),
+    ],
 )
 def test_a_node_without_a_signature_has_the_name_of_its_own_teds(
     verdict: str | None, name: str, unverified: bool, monkeypatch: pytest.MonkeyPatch
@@ -187,3 +192,10 @@ def test_a_channel_is_one_of_the_datasheet_or_any_number_if_that_is_not_known(
     has = "1 (opening), 2 (grip force), 3 (Twice), 4 (Twice)" if uuid == HAND else "none"
     assert refused.value.message == f"{uuid.hex()} has no channel {channel!r}."
     assert refused.value.hint == f"Channels in its datasheet: {has}."
+
+
+def test_the_topic_that_another_channel_has_by_default_is_taken(desk: Path) -> None:
+    refused = call(desk, "--json", "names", "set", "hand", 1, "bench/hand/grip_force")
+    assert (refused.code, f"channel 2 of node {H}" in refused.json["error"]["message"]) == (2, True)
+    assert "(chosen)" not in shown(desk, "list")
+    shown(desk, "set", "hand", 2, "bench/hand/grip_force")

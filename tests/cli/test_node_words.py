@@ -640,3 +640,14 @@ def test_boards_that_were_located_are_listed_with_their_names(home: Path, monkey
             f"{NODE}  thumb\n{THIRD.hex()}  (no name)",
         ),
     ]
+
+
+def test_a_board_that_may_not_be_updated_has_its_line_before_the_others_are_asked_about(updating: Any) -> None:
+    refused = ended("refused", REFUSED, OTHER)
+    lines = lines_of(updating({OTHER: refused, UUID: plan()}, [ended("updated")], "--yes", as_json=True)[0])
+    assert [(line.get("uuid"), line.get("result")) for line in lines] == [
+        (OTHER.hex(), "refused"), (NODE, "updated"), (None, None),
+    ]  # fmt: skip
+    assert lines[0]["error"]["message"] == "It is older."
+    people = updating({OTHER: refused, UUID: plan()}, [ended("updated")], "--yes")[0]
+    assert f"Error ({OTHER.hex()}): It is older." in people.err

@@ -132,3 +132,18 @@ def test_cause_and_cure_of_a_failure_are_both_told() -> None:
     assert "The node is silent. → Put it back." in terminal.lines
     terminal.screen.ended(failed(3, DeclinedError("You said no.")))
     assert any("SKIPPED" in line for line in terminal.lines)
+
+
+def test_what_runs_below_the_screen_is_removed_before_each_drawing() -> None:
+    course: list[str] = []
+
+    class Out(io.StringIO):
+        def write(self, text: str) -> int:
+            course.extend([] if course[-1:] == ["drawn"] else ["drawn"])
+            return len(text)
+
+    console = Console(file=Out(), force_terminal=True, width=80, height=24, color_system=None)
+    screen = OperatorScreen(console, Batch(next_row=row(1)), lambda: course.append("removed"))
+    screen.begun()
+    assert course == ["removed", "drawn", "removed", "drawn"]
+    screen.close()

@@ -419,3 +419,9 @@ def test_what_is_good_is_green(octets: bytes, verdict: str, colour: str) -> None
     console = consoles.CleanConsole(file=out, force_terminal=True, color_system="standard", width=200)
     show.print_teds(console, describe(TedsBlock(None, None, octets), {}))
     assert f"\x1b[{colour}m{verdict}\x1b[0m" in out.getvalue()
+
+
+def test_what_a_teds_means_is_foreign_text(printed: Any) -> None:
+    shown = replace(describe(TedsBlock(None, 12, NAME), {}), summary=(("name", "[red]thumb[/]"), ("unit", "m\x1b[2J")))
+    lines = printed(lambda console: show.print_teds(console, shown))
+    assert lines[1:3] == ["  name: [red]thumb[/]", "  unit: m\\x1b[2J"]

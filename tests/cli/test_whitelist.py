@@ -264,3 +264,12 @@ def test_what_another_command_adds_meanwhile_is_not_written_over(home: Path, mon
     others.append(["whitelist", "add", TWO, "--fingerprint", KEY, "--name", "palm"])
     same = call(home, "--json", "whitelist", "add", TWO, "--fingerprint", KEY, "--name", "palm").json
     assert (same["added"], same["changed"], same["unchanged"]) == (0, 0, 1)
+
+
+@pytest.mark.parametrize("words", [[], ["--dry-run"], ["--format", "csv"]])
+def test_a_list_on_stdout_is_no_result_in_json_neither_is_its_plan(home: Path, words: list[str]) -> None:
+    refused = call(home, "--json", "whitelist", "export", "-", *words)
+    assert (refused.code, refused.json["error"]) == (
+        2,
+        {"code": "usage", "message": "--json prints the whitelist itself.", "hint": "Omit --json, or name a file."},
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -232,8 +233,11 @@ def test_whole_files_for_ros2_control() -> None:
 
 @pytest.mark.parametrize(
     ("periods", "rate"),
-    [((0.02, 0.05, 0.1), 10), ((0.001, 0.3, 0.2), 3), ((3.0, 0.1, 0.1), 1), ((0.01, math.nan, 0.0), 100)],
-)
+    [
+        ((0.02, 0.05, 0.1), 10), ((0.001, 0.3, 0.2), 3), ((3.0, 0.1, 0.1), 1), ((0.01, math.nan, 0.0), 100),
+        ((0.02, 0.05, struct.unpack("f", struct.pack("f", 0.1))[0]), 10),  # as a datasheet holds it
+    ],
+)  # fmt: skip
 def test_the_rate_is_whole_hertz_of_the_slowest_channel_of_a_joint_and_never_0(
     periods: tuple[float, ...], rate: int
 ) -> None:

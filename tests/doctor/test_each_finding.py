@@ -394,7 +394,10 @@ def test_a_hardware_clock_may_run_in_local_time(
     monkeypatch.setattr(
         machine, "time", SimpleNamespace(time=lambda: 1_780_000_000.0, timezone=-3600, altzone=-7200, localtime=local)
     )
-    assert one(machine.clock(system)).result == result
+    found = one(machine.clock(system))
+    assert found.result == result
+    if result == "warning":
+        assert found.why == f"The hardware clock differs from the system's by {seconds} s."
 
 
 @pytest.mark.parametrize(
