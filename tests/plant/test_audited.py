@@ -239,6 +239,14 @@ def test_keys_are_reviewed_when_another_station_is_removed_and_each_hour(
     assert removed_members.last(opened) == review(NOW, WEST)
 
 
+def test_files_of_evidence_are_those_of_a_board_and_a_number(tmp_path: Path) -> None:
+    for name in (f"{A.hex()}.1.json", f"{A.hex()}.12.json", f"{B.hex()}.3.json", f"{A.hex()}.json", "x.1.json"):
+        (tmp_path / name).touch()
+    assert evidence._evidence_files(tmp_path) == {A.hex(): {1, 12}, B.hex(): {3}}
+    assert evidence._evidence_files(tmp_path / "nowhere") == {}
+    assert evidence._evidence_files(tmp_path / "x.1.json") == {}, "writing there says what is wrong"
+
+
 @pytest.mark.parametrize(
     "error", [LinkError("x"), NodeRefusedError("x", reason=1), NotAuthenticError("x"), SessionLostError(LinkError("x"))]
 )

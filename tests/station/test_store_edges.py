@@ -203,6 +203,7 @@ def test_of_a_store_that_can_only_be_read_everything_is_read_and_nothing_changed
         raise sqlite3.DatabaseError("malformed")
 
     for failing in (full, damaged):
+        why.__cause__ = OSError(errno.EROFS, "Read-only file system")
         monkeypatch.setattr(database, "open_copy", failing)
         with pytest.raises(StoreError) as error:
             Store.open(store.home)
@@ -615,6 +616,34 @@ def test_one_command_waits_a_minute_for_a_node_and_owns_a_measurement_alone(
     )  # fmt: skip
 
 
+def test_a_lock_that_another_one_holds_or_that_cannot_be_read_has_no_name(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """POSIX lets a system answer EACCES or EAGAIN for a lock that is held."""
+    fates = iter([PermissionError("EACCES"), BlockingIOError("EAGAIN"), OSError(errno.ENOLCK, "No locks")])
+
+    def fails(*_: Any) -> Any:
+        raise next(fates)
+
+    held = NodeLock(place, NODE)
+    with monkeypatch.context() as patch:
+        patch.setattr(lock, "fcntl", SimpleNamespace(fcntl=fails, F_OFD_SETLK=0, F_WRLCK=0))
+        assert [held._try_to_lock(0), held._try_to_lock(0)] == [False, False]
+        with pytest.raises(StoreError):
+            held._try_to_lock(0)
+        patch.setattr(lock, "_read_at_start", full)
+        assert lock._holder(0) == OTHER
+
+
+def test_a_head_of_a_backup_that_is_nested_too_deep_holds_no_store(monkeypatch: pytest.MonkeyPatch) -> None:
+    def loads(_: object) -> Any:
+        raise RecursionError
+
+    monkeypatch.setattr(dump, "json", SimpleNamespace(loads=loads))
+    with pytest.raises(BadDataError, match="The backup holds no store"):
+        dump._head(cast("Any", dumped()))
+
+
 def test_without_locks_of_the_system_a_database_beside_the_file_is_locked(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -714,9 +743,10 @@ def test_a_dump_that_breaks_a_reference_or_finds_no_room(store: Store, monkeypat
     with pytest.raises(BadDataError) as error:
         loads(None, referring=True)
     assert error.value.message == "The store in the backup is damaged."
-    with pytest.raises(BadDataError) as error:
-        loads(sqlite3.IntegrityError)
-    assert error.value.message == "The store in the backup breaks a rule of its tables."
+    for rule in (sqlite3.IntegrityError, sqlite3.DataError, lambda _: UnicodeDecodeError("utf-8", b"x", 0, 1, "no")):
+        with pytest.raises(BadDataError) as error:
+            loads(cast("Any", rule))
+        assert error.value.message == "The store in the backup breaks a rule of its tables."
     with pytest.raises(StoreError) as failed:
         loads(sqlite3.OperationalError)
     assert (failed.value.message, failed.value.hint) == (
