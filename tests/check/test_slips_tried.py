@@ -16,7 +16,7 @@ from teds_provision.check.run import _Run
 from teds_provision.check.slips import Slip
 from teds_provision.errors import BadDataError, GarbledError, LinkError, NotAuthenticError, PolicyError
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, verify
-from teds_provision.protocol.messages.frames import Command, Reply, TedsStatus
+from teds_provision.protocol.messages.frames import Command, Reason, Reply, TedsStatus
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.can_frames import DataAddress, cut
 from teds_provision.teds.sheet import ChannelKind
@@ -585,3 +585,56 @@ def test_the_boards_own_teds_that_cannot_be_restored_keep_it_from_no_reset(
     _Run._key_and_back(rig, sessions_too=False)
     assert stages[7:] == ["AGREEMENT", "COMMIT", "MEASURING", "ROTATION", "RESET"]
     assert removed == [UUID], "a node that was not reset still has the key"
+
+
+def _commit_of(monkeypatch: pytest.MonkeyPatch, stored: bytes) -> tuple[Any, list[str]]:
+    """Return a board that stores this Security TEDS after a commit that is to be refused, and what it was sent."""
+    sent: list[str] = []
+
+    def sealed_refused(*_: Any) -> str:
+        sent.append("refused?")
+        raise RuleBrokenError("it was accepted")
+
+    monkeypatch.setattr(write_rules, "_write", lambda _probe, _block, octets: sent.append(f"write {octets.decode()}"))
+    monkeypatch.setattr(write_rules, "_signed", lambda *_: b"good")
+    monkeypatch.setattr(write_rules, "_sheet", lambda *_: None)
+    monkeypatch.setattr(write_rules, "stored_blocks", lambda _probe: {})
+    probe: Any = SimpleNamespace(
+        identity=lambda: "identity", teds=lambda _block: stored, listed=list, sealed_refused=sealed_refused,
+        sealed=lambda _command: sent.append("update"), close=lambda: sent.append("close"),
+    )  # fmt: skip
+    return probe, sent
+
+
+@pytest.mark.parametrize(("stored", "repair"), [(b"wrong", ["write good", "update", "close"]), (b"former", [])])
+def test_a_board_that_accepted_a_wrong_datasheet_gets_a_good_one_for_the_rules_after_it(
+    monkeypatch: pytest.MonkeyPatch, stored: bytes, repair: list[str]
+) -> None:
+    probe, sent = _commit_of(monkeypatch, stored)
+    with pytest.raises(RuleBrokenError, match="it was accepted"):
+        write_rules._refused_over(probe, Reason.BAD_SIGNATURE, "104 wrong", b"wrong")
+    assert sent == ["write wrong", "refused?", *repair]
+
+
+@pytest.mark.parametrize("again", [b"first", b"another"])
+def test_a_repeated_open_opens_the_session_of_its_first_reply(monkeypatch: pytest.MonkeyPatch, again: bytes) -> None:
+    """profile.md, "Repetition": the stored reply is given, and the session of it is used."""
+    order: list[str] = []
+    made = SimpleNamespace(
+        open=lambda counter: SimpleNamespace(encode=lambda: b"open " + counter),
+        accept=lambda payload: order.append(f"accept {payload.decode()}"),
+    )
+    monkeypatch.setattr(session_rules, "StationSession", lambda *_: made)
+    monkeypatch.setattr(session_rules, "_opens", lambda _probe: order.append("opens"))
+    probe: Any = SimpleNamespace(
+        link_key=KEY, uuid=UUID, session=None, opening_counter=lambda: b"c",
+        resending=SimpleNamespace(resend=lambda frame: Reply(True, again).encode() if frame == b"open c" else b""),
+        octets=lambda _frame, _what: Reply(True, b"first"), close=lambda: order.append("close"),
+    )  # fmt: skip
+    probe.sealed_good = lambda _command: order.append(f"sealed {probe.session is made}")
+    if again != b"first":
+        with pytest.raises(RuleBrokenError, match=r"Open \(128.3\) repeated: the stored reply is due"):
+            session_rules.repetition_open(probe)
+        return
+    assert session_rules.repetition_open(probe) == "the stored reply, and a session under it"
+    assert order == ["opens", "accept first", "sealed True", "close"]

@@ -378,7 +378,7 @@ def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:
         assert not port._streams.opened
 
 
-@pytest.mark.parametrize(("period", "quick"), [(MS, True), (100 * MS, False)])
+@pytest.mark.parametrize(("period", "quick"), [(MS, True), (16 * MS, True), (17 * MS, False), (100 * MS, False)])
 def test_all_values_are_calibrated_beforehand_only_for_a_stream_of_many_messages(
     period: int, quick: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

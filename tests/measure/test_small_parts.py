@@ -20,7 +20,7 @@ from teds_provision.errors import (
     TedsProvisionError,
     VaultLockedError,
 )
-from teds_provision.measure import capture, matching, node_supervisor, standing, zero
+from teds_provision.measure import capture, matching, node_supervisor, standing, verified_session, zero
 from teds_provision.measure import clock as of_clock
 from teds_provision.measure.blocks import SetPointCommand, StationFacts
 from teds_provision.measure.clock import SLEW, ClockMap, HostClock, WallClock
@@ -34,6 +34,7 @@ from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.measurement import Measurement
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.stream_receiver import HearingThread, ReceivedStream
+from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.store.records import KeptMeasurement
 
 UUID = bytes(range(10))
@@ -314,6 +315,21 @@ def test_a_set_point_goes_to_its_node_and_one_for_a_node_that_is_not_measured_to
     assert came == [mine]
 
 
+def test_a_measurement_that_fails_ends_its_nodes_and_sinks_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[int] = []
+    buses: Any = SimpleNamespace(expect=lambda _uuids: None)
+    made = Measurement(NONE, buses, (), MeasurementRequest(), (), StationFacts("bench"))
+
+    def fails(*_: Any) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(made, "_loop", fails)
+    monkeypatch.setattr(made, "_end", lambda: ended.append(1))
+    with pytest.raises(ZeroDivisionError):
+        made.run(threading.Event())
+    assert ended == [1]
+
+
 @pytest.mark.parametrize("ending", [False, True])
 @pytest.mark.parametrize("known", [False, True])
 def test_a_node_that_comes_while_the_measurement_ends_begins_no_more(
@@ -449,3 +465,126 @@ def test_a_reading_outside_of_the_calibrated_range_is_warned_of_with_both_ends()
         assert (
             "This node has a draft, which does not include this zero offset; to drop it: draft drop UUID." in warnings
         ) is (draft is not None)
+
+
+class _Steps:
+    """The steps of a command; each has a detail."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+
+    def step(self, name: str) -> Any:
+        self.done.append(name)
+        return nullcontext(SimpleNamespace(detail="", result=None))
+
+
+@pytest.mark.parametrize(
+    ("moved", "dry_run", "asked"),
+    [(0.5, False, "brought"), (-0.5, False, "brought"), (-0.5, True, "planned"), (0.01, False, ""), (-0.01, False, "")],
+)
+def test_a_zero_offset_is_written_if_it_moves_either_way_by_more_than_the_doubt(
+    monkeypatch: pytest.MonkeyPatch, moved: float, dry_run: bool, asked: str
+) -> None:
+    """A dry run records nothing at the guard of calibrations, and writes nothing."""
+    guarded: list[dict[str, Any]] = []
+
+    def guard(*_: Any, **more: Any) -> tuple[str, ...]:
+        guarded.append(more)
+        return ()
+
+    unit = SimpleNamespace(scale=1.0, difference_to_si=lambda value: value)
+    own = SimpleNamespace(zero_offset=2.0, unit=unit)
+    channel = SimpleNamespace(
+        number=1, full_turn=False, show_reading=lambda *_: "", show=lambda *_, **__: "", si_unit="rad"
+    )
+    image = SimpleNamespace(blocks={(1, 5): b"curve"}, unsigned_blocks=dict)
+    reading = SimpleNamespace(mean=1.0, count=32, spread=0.0, doubt=0.02)
+    for name, made in {
+        "require_session": lambda *_: None,
+        "verify_in_session": lambda *_, **__: SimpleNamespace(image=image),
+        "trusted_from": lambda *_: None,
+        "_adjustable": lambda *_: (channel, own),
+        "turn_of": lambda *_, **__: None,
+        "take_samples_of": lambda *_, **__: SimpleNamespace(extrapolated=False),
+        "require_still": lambda _settled: reading,
+        "offset_for": lambda *_: 2.0 + moved,
+        "shortest": lambda given, _turn: given,
+        "_si": lambda _channel, _own, value: value,
+        "with_zero_offset": lambda *_: b"new",
+        "guard": guard,
+        "diff_blocks": lambda *_: (),
+        "require_not_measured": lambda *_, **__: None,
+        "_require_nobody_else": lambda *_: None,
+    }.items():
+        monkeypatch.setattr(zero, name, made)
+    node = SimpleNamespace(uuid=UUID, proven=SimpleNamespace(sequence=7, epoch=1), tapped=False)
+    run: Any = SimpleNamespace(
+        visit=SimpleNamespace(station=None, node=node, released=None), steps=_Steps(), dry_run=dry_run,
+        order=SimpleNamespace(channel=1, accept_calibration=None), _wanted=lambda *_: 0.0, _warnings=lambda *_: (),
+        _bring=lambda _image, found: ("brought", found),
+    )  # fmt: skip
+    found: Any = zero._ZeroRun.run(run)
+    how, result = found if isinstance(found, tuple) else ("", found)
+    assert how == ("brought" if asked == "brought" else "")
+    assert [more["record"] for more in guarded] == {"brought": [True], "planned": [False], "": []}[asked]
+    assert (result.offset, result.moved) == ((2.0 + moved, pytest.approx(moved)) if asked else (2.0, 0.0))
+    assert run.steps.done == (["read", "build"] if asked else ["read"])
+
+
+@pytest.mark.parametrize(("span", "at_once"), [(11_999_999, False), (12_000_000, True), (20_000_000, True)])
+def test_a_message_of_12_ms_or_more_waits_for_no_other(span: int, at_once: bool) -> None:
+    subscribe = SimpleNamespace(kind=StreamKind.PERIODIC, period=1_000_000, test_pattern=False)
+    made: Any = SimpleNamespace(receiver=SimpleNamespace(plan=SimpleNamespace(span=span, subscribe=subscribe)))
+    ReceivedStream.__post_init__(made)
+    assert (made._at_once, made._last_instant) == (at_once, span - 1_000_000)
+    subscribe.kind = StreamKind.FREE
+    ReceivedStream.__post_init__(made)
+    assert made._last_instant == 0
+
+
+def test_the_bounds_of_a_batch_are_those_of_its_last_arrival() -> None:
+    """What came by then may be as late as that; by the first one's, the last ones would be of the future."""
+    asked: list[int] = []
+
+    def lead_bounds(at: int) -> int:
+        asked.append(at)
+        return at
+
+    opened: list[Any] = []
+
+    def open_messages(came: Any, bounds: int) -> list[Any]:
+        opened.append((came, bounds))
+        return []
+
+    made: Any = SimpleNamespace(
+        _order=threading.RLock(), _came=deque([(b"a", 5), (b"b", 9)]), mapping=threading.Lock(),
+        receiver=SimpleNamespace(open_messages=open_messages), clock=SimpleNamespace(lead_bounds=lead_bounds),
+        interpreter=SimpleNamespace(blocks=lambda _messages: []), _hand_on=lambda *_: None,
+    )  # fmt: skip
+    ReceivedStream.finish(made)
+    assert (asked, opened, len(made._came)) == ([9], [([(b"a", 5), (b"b", 9)], 9)], 0)
+    ReceivedStream.finish(made)
+    assert asked == [9], "nothing was left"
+
+
+def test_a_node_that_may_not_be_measured_is_not_even_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    for name in ("require_measurable", "require_session", "verify_in_session", "trusted_from"):
+
+        def asked(*_: Any, name: str = name, **__: Any) -> str:
+            order.append(name)
+            if name == refuses:
+                raise PolicyError("Not listed.")
+            return name
+
+        monkeypatch.setattr(verified_session, name, asked)
+    refuses = ""
+    node: Any = SimpleNamespace(uuid=UUID)
+    assert verified_session.open_trusted(NONE, node, by="measure") == "trusted_from"  # type: ignore[comparison-overlap]
+    assert order == ["require_measurable", "require_session", "verify_in_session", "trusted_from"]
+    refuses = "require_measurable"
+    for opens in (verified_session.open_trusted, verified_session.open_unverified):
+        order.clear()
+        with pytest.raises(PolicyError, match="Not listed"):
+            opens(NONE, node, by="measure")
+        assert order == ["require_measurable"]

@@ -141,6 +141,15 @@ def test_a_time_that_is_none_is_0(when: object) -> None:
     assert source.unix_of(when) == 0.0 or when == "9999-12-31T23:59:59"
 
 
+@pytest.mark.parametrize("error", [ValueError("no time"), OverflowError("beyond")])
+def test_a_time_beyond_that_of_the_machine_is_0(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def fails(_text: str) -> Any:
+        raise error
+
+    monkeypatch.setattr("datetime.datetime", SimpleNamespace(fromisoformat=fails))
+    assert source.unix_of("2026-01-01") == 0.0
+
+
 def test_a_vector_has_no_more_channels_than_are_read() -> None:
     words = {"uuid": ARM, "number": 1, "name": "x"}
     most = source.MOST.text
@@ -193,6 +202,18 @@ def test_a_channel_with_gaps_is_read_and_its_large_raw_values_stay_exact(tmp_pat
     assert filled.tolist() == [large, 0, -large]
 
 
+def test_rows_without_a_tick_are_read_with_tick_0_and_the_others_stay_exact(tmp_path: Path) -> None:
+    """Other programs write null; as a float the last tick would be another one."""
+    path, last = tmp_path / "run.parquet", 2**63 + 1
+    _parquet(path, [block()])
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("tick")
+    ticks = pa.array([None, 5, last], pa.uint64())
+    pq.write_table(table.set_column(place, table.schema.field(place), ticks), path)
+    [read] = [entry for entry in open_recording(path).entries() if isinstance(entry, Block)]
+    assert read.tick.tolist() == [0, 5, last]
+
+
 @pytest.mark.parametrize("octets", [b"PAR1 nothing PAR1", b"PAR1", b"PAR1" + bytes(40) + b"\xff\xff\0\0PAR1"])
 def test_a_file_that_only_begins_as_parquet_is_damaged(tmp_path: Path, octets: bytes) -> None:
     path = tmp_path / "run.parquet"
@@ -202,7 +223,9 @@ def test_a_file_that_only_begins_as_parquet_is_damaged(tmp_path: Path, octets: b
     assert refused.value.message.startswith(f"{path}: it is not a complete Parquet file: ")
 
 
-@pytest.mark.parametrize("error", [TypeError("odd"), ValueError("odd"), OSError("odd"), pa.ArrowInvalid("odd")])
+@pytest.mark.parametrize(
+    "error", [TypeError("odd"), ValueError("odd"), OSError("odd"), pa.ArrowNotImplementedError("odd")]
+)
 def test_values_of_parquet_that_cannot_be_read_are_damage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from teds_provision.errors import BadDataError, UsageError
+from teds_provision.errors import BadDataError, StoreError, UsageError
 from teds_provision.measure import sinks
 from teds_provision.measure.blocks import ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks import files, in_units, json_events, names, open_sink, vectors, without_scalars
@@ -163,6 +163,28 @@ def test_a_part_without_a_whole_piece_is_removed_though_its_folder_may_refuse_th
             assert path.exists() is (there and not missing)
 
 
+@pytest.mark.parametrize("gaps", [0, 1, 4])
+def test_a_recording_with_gaps_ends_with_the_last_three_of_them(monkeypatch: pytest.MonkeyPatch, gaps: int) -> None:
+    """Also if the disk is so full that its last part cannot be mended."""
+    made = TextSink(Path("run.csv"))
+    made._full, made._parts = (0.0, 0, "disk is full"), [Path("run.csv")]
+    made._gaps = [f"gap {number}." for number in range(gaps)]
+    mended: list[Path] = []
+
+    def mend(path: Path) -> None:
+        mended.append(path)
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(made, "_mend", mend)
+    with pytest.raises(StoreError) as ended:
+        made._finish()
+    last = "The disk is full since 1970-01-01T00:00:00.000Z: 0 values are not recorded."
+    shown = " ".join([*[f"gap {number}." for number in range(gaps)][-2:], last])
+    assert ended.value.message == f"run.csv has {gaps + 1} {'gap' if gaps == 0 else 'gaps'}. {shown}"
+    assert ended.value.hint == "Free some space before the next run; what was written is intact."
+    assert mended == [Path("run.csv")]
+
+
 def test_a_folder_without_locks_is_recorded_to_and_one_that_is_gone_leaves_nothing_open(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -292,6 +314,7 @@ def test_a_chunk_without_messages_stays_octet_for_octet(tmp_path: Path) -> None:
     path = finished(tmp_path / "run.mcap", KIND, channel(), described, b"\0" * 5, chunk(message()), index((5, 0)))
     done = recover(path)
     assert done.messages == 1
+    assert done.output is not None
     assert described in done.output.read_bytes()
 
 
@@ -358,6 +381,7 @@ def test_a_name_that_ends_in_the_digits_of_another_node_gets_its_own_behind_it(n
     [
         (" Grün-Öl ", "grun_ol"), ("__a__", "a"), ("a" * 59 + " b", "a" * 59), ("3 axes", "n_3_axes"), ("ß", "ss"),
         ("…", ""),
+        ("_" + "a" * 70, "a" * 60), ("ℍand", "hand"),
     ],
 )  # fmt: skip
 def test_a_part_of_a_topic_begins_and_ends_with_a_letter_or_digit(given: str, made: str) -> None:
