@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests import second_try
+from tests.pace import PATIENCE
 from tests.second_try import NOTES, Failure, Outcomes, main, refusal
+from tests.zygote import Zygote
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +34,10 @@ def fails_once(name="seen"):
 
 
 class Suite:
-    """A temporary suite of one file, and how its run ended: in this process, or by the command of the gate."""
+    """A temporary suite of one file, and how its run ended: in this process, or by the command of the gate.
+
+    Each pytest of the former is a fork of one that has imported pytest; those of the latter are started.
+    """
 
     def __init__(self, folder: Path, printed: pytest.CaptureFixture[str]) -> None:
         self.folder = folder
@@ -57,8 +65,23 @@ class Suite:
         return file.read_text() if file.exists() else ""
 
 
+@pytest.fixture(scope="module")
+def ready() -> Iterator[Zygote]:
+    """Yield a process that has imported pytest: each test has three runs of it, of which most is that import."""
+    made = Zygote(dict(os.environ), module="pytest")
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def suite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Suite:
+def suite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], ready: Zygote) -> Suite:
+    def forked(words: list[str], *, check: bool) -> SimpleNamespace:
+        assert words[:3] == [sys.executable, "-m", "pytest"]
+        assert not check
+        run = ready.run("pytest", words[3:], dict(os.environ), out=1, err=2, cwd=tmp_path)
+        return SimpleNamespace(returncode=run.wait(PATIENCE))
+
+    monkeypatch.setattr(second_try, "subprocess", SimpleNamespace(run=forked))
     monkeypatch.chdir(tmp_path)
     for name, value in (("PYTHONPATH", str(ROOT)), ("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1"), ("PYTEST_ADDOPTS", "")):
         monkeypatch.setenv(name, value)
