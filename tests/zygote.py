@@ -399,7 +399,10 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: for the tests, which end this one
     if sys.argv[2:]:
         importlib.import_module(sys.argv[2])
-        del sys.modules[sys.argv[2]]  # it runs as __main__
+        del sys.modules[sys.argv[2]]  # it runs as __main__, and who imports it then gets one of its own
+        folder, _, name = sys.argv[2].rpartition(".")
+        if folder:
+            delattr(sys.modules[folder], name)
     else:
         _import_all()
     assert threading.active_count() == 1

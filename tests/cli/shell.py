@@ -106,11 +106,21 @@ def zygote() -> Zygote:
     return made
 
 
-def _imports_ours(program: tuple[str, ...]) -> bool:
-    """Return True for the program and for modules of the tests; the strangers share nothing with either."""
+@functools.cache
+def _of_strangers() -> Zygote:
+    """Return the zygote of the strangers, which share nothing with the product: it has imported their node alone."""
+    made = Zygote(clean_environment(), module="tests.strangers.node")
+    atexit.register(made.close)
+    return made
+
+
+def _zygote_of(program: tuple[str, ...]) -> Zygote | None:
+    """Return what to fork for the program, or for a module of the tests or of the strangers; None for anything else."""
     if program[:2] != PROGRAM[:2] or len(program) != len(PROGRAM):
-        return False
-    return program == PROGRAM or (program[2].startswith("tests.") and not program[2].startswith("tests.strangers."))
+        return None
+    if program[2].startswith("tests.strangers."):
+        return _of_strangers()
+    return zygote() if program == PROGRAM or program[2].startswith("tests.") else None
 
 
 def begin(
@@ -125,19 +135,21 @@ def begin(
 ) -> ForkedProcess | subprocess.Popen[bytes]:
     """Start the program as a process of its own that writes to two files; the passphrase goes by --passphrase-fd.
 
-    It, and a module of the tests, is a fork of the zygote where nobody could tell, else (and without ``fork``) a start
+    It, and a module of the tests, is a fork of a zygote where nobody could tell, else (and without ``fork``) a start
     of an interpreter.
     """
     read, write = os.pipe()
     asked = environment if environment is not None else clean_environment()
-    fork = fork and _imports_ours(program) and forkable(asked, zygote().environment)
-    given = [] if passphrase is None else ["--passphrase-fd", str(FIRST_FD if fork else read)]
+    ready = _zygote_of(program) if fork else None
+    if ready is not None and not forkable(asked, ready.environment):
+        ready = None
+    given = [] if passphrase is None else ["--passphrase-fd", str(FIRST_FD if ready else read)]
     os.write(write, (passphrase or "").encode() + b"\n")
     os.close(write)
     whole, folder = [*given, *map(str, words)], cwd or Path.cwd()
     try:
-        if fork:
-            return zygote().run(program[-1], whole, asked, out=out, err=err, given=(read,), cwd=folder)
+        if ready is not None:
+            return ready.run(program[-1], whole, asked, out=out, err=err, given=(read,), cwd=folder)
         return subprocess.Popen(
             [*program, *whole],
             stdin=subprocess.DEVNULL,
