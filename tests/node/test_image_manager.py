@@ -85,7 +85,8 @@ def test_what_the_manager_answers(manager: ImageManager, slots: Slots) -> None:
     assert ask(manager, 8, 0, 6) == {"buf_size": 2048, "buf_count": 1}
     assert ask(manager, 8, 0, 8) == {"bootloader": "MCUboot"}
     assert ask(manager, 8, 0, 8, query="mode") == {"mode": 3}
-    assert ask(manager, 8, 0, 8, query="other") == {"err": {"group": 0, "rc": 5}}
+    for query in ("other", ""):
+        assert ask(manager, 8, 0, 8, query=query) == {"err": {"group": 0, "rc": 5}}
     assert ask(manager, 8, 1, 6) == {
         "images": [{"image": 0, "slots": [{"slot": 0, "size": 1048576}, {"slot": 1, "size": 1048576}]}]
     }

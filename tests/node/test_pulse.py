@@ -106,3 +106,32 @@ def test_a_node_that_fails_rests_until_it_is_woken(
     pulse._run()
     assert (beats, caplog.messages) == (["beat"], logged)
     assert pulse._due == {}
+
+
+def test_a_node_that_is_late_already_is_called_again_at_once() -> None:
+    pulse = RealtimeLoop()
+    waits = [0.0, 0.0, None]
+    beats: list[int] = []
+
+    class Late:
+        def beat(self) -> float | None:
+            beats.append(len(beats))
+            wait = waits.pop(0)
+            if wait is None:
+                pulse.stop()
+            elif len(beats) > 5:
+                raise AssertionError
+            return wait
+
+    class Last:
+        """It ends the loop if nothing else does."""
+
+        def beat(self) -> float | None:
+            if not pulse._heap:
+                pulse.stop()
+            return None
+
+    pulse.wake(Late())
+    pulse.wake(Last())
+    pulse._run()
+    assert beats == [0, 1, 2]

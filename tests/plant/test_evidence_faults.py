@@ -199,7 +199,8 @@ def test_a_statement_is_whole_and_in_the_order_of_the_contract() -> None:
     ("member", "value", "good"),
     [
         ("unit", 1, True), ("unit", 0, False), ("unit", None, True), ("attempt", 1, True), ("attempt", 0, False),
-        ("attempt", None, False), ("heads", ["0" * 16, 3], True), ("heads", ["0" * 15, 3], False),
+        ("attempt", None, False), ("heads", "", False), ("heads", [], False), ("heads", ["0" * 16, 3], True),
+        ("heads", ["0" * 15, 3], False),
         ("heads", ["0" * 16], False), ("heads", ["G" * 16, 3], False), ("heads", ["A" * 16, 3], False),
         ("heads", ["0" * 16, -1], False), ("heads", ["0" * 16, True], False), ("heads", ["0" * 16, 0], True),
         ("epoch", 4_294_967_295, True),

@@ -437,6 +437,13 @@ def test_a_value_that_fits_no_argument_is_named(kind: str, value: Any) -> None:
     assert no.value.message == f"The argument 'it' of Read does not fit {kind}: {value!r}."
 
 
+def test_of_arguments_that_are_not_known_the_first_by_its_name_is_named() -> None:
+    for number in range(10):
+        values = {f"{letter}{number}": 1 for letter in "zyxabc"}
+        with pytest.raises(BadDataError, match=f"Read has no argument 'a{number}'"):
+            write_plain("it:u8", {"it": 1, **values}, of="Read")
+
+
 def test_a_text_of_a_message_holds_no_nul() -> None:
     assert _octets("texts", ("a", "bé")).hex() == "610062c3a900"
     with pytest.raises(ValueError, match="a text ends at its first NUL"):
