@@ -84,6 +84,11 @@ def test_a_table_keeps_the_line_of_each_row_its_unit_and_its_metadata() -> None:
         ("raw,value\n1,2.x\n", 'c.csv:2: value: "2.x" is not a number.'),
         ("raw,value\n1_0,2\n", 'c.csv:2: raw: "1_0" is not a number.'),
         ("raw,value\n1,inf\n", 'c.csv:2: value: "inf" is not a number.'),
+        (f"raw,value\n0x{'f' * 300},1\n", f'c.csv:2: raw: "0x{"f" * 38}" is not a number.'),
+        (
+            f"1,0x{'f' * 300},3\n1,2,3\n",
+            "c.csv:1: the header names 3 columns besides the channel; raw value and value are two.",
+        ),
         ("raw;value\n1;1,000,5\n", 'c.csv:2: value: "1,000,5" is not a number.'),
         (f"raw,value\n1,{'y' * 50}\n", f'c.csv:2: value: "{"y" * 40}" is not a number.'),
         ("ch,raw,value\n1.5,1,2\n", 'c.csv:2: channel: "1.5" is not the number of a channel.'),

@@ -10,6 +10,7 @@ from typing import cast
 import pytest
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.x509 import verification
 from lxml import etree
 
 from teds_provision.errors import BadDataError, NotAuthenticError
@@ -267,7 +268,7 @@ def test_a_stated_time_of_signing_is_one_of_the_years_1970_to_8999(stated: str, 
 
 @pytest.mark.parametrize(
     "damage",
-    [ValueError("x"), x509.DuplicateExtension("x", x509.KeyUsage.oid)],
+    [ValueError("x"), x509.DuplicateExtension("x", x509.KeyUsage.oid), x509.UnsupportedGeneralNameType("x")],
     ids=lambda damage: type(damage).__name__,
 )
 def test_a_key_whose_use_cannot_be_read_may_not_sign(damage: Exception) -> None:
@@ -304,3 +305,19 @@ def test_a_signers_certificate_that_cannot_be_read_makes_the_signature_one_that_
     assert read(signed).unchecked[0] == why
     with pytest.raises(NotAuthenticError, match="a certificate in it cannot be read"):
         read(signed, lab.certificate)
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [ValueError("x"), x509.UnsupportedGeneralNameType("x"), verification.VerificationError("x")],
+    ids=lambda failure: type(failure).__name__,
+)
+def test_a_chain_that_cannot_be_judged_leads_to_no_trusted_ca(
+    failure: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(verification, "Store", fails)
+    leaf = cast(x509.Certificate, None)
+    assert not signature._leads_to(leaf, [], [], datetime.now(UTC))

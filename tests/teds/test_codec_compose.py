@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
@@ -175,6 +176,11 @@ def test_units_may_be_given_packed(extension: str, stated: int) -> None:
         "K",
         {"kelvin": 1},
         {"kelvins": "x"},
+        {"kelvins": None},
+        {"kelvins": [1]},
+        {"kelvins": math.inf},
+        {"kelvins": math.nan},
+        {"kelvins": "1/0"},
         {"meters": 100},
         {"meters": 0.3},
         {"interpretation": 300},

@@ -27,12 +27,13 @@ from teds_provision.teds.profile import (
     find_profile,
     keys,
     list_profiles,
+    load,
     load_profile,
     passed_over,
     shipped_profiles,
     template,
 )
-from teds_provision.teds.profile.load import describe_channel, files_digest, listed, parse_profile
+from teds_provision.teds.profile.load import _is_base, describe_channel, files_digest, listed, parse_profile
 from teds_provision.teds.profile.model import CalibrationDemand
 from teds_provision.teds.profile.reader import key_lines
 from teds_provision.teds.show import describe
@@ -164,6 +165,9 @@ def test_a_broken_profile_is_listed_with_its_error(tmp_path: Path) -> None:
     assert "broken.toml:1" in entry.error
     file = str(tmp_path / "broken.toml")
     assert listed(entry) == {"name": "broken", "file": file, "error": entry.error}
+    write(tmp_path, "broken", 'extends = "no-such-type"\n')
+    (entry,) = list_profiles([tmp_path])
+    assert (entry.profile, "no-such-type" in entry.error) == (None, True)
     write(tmp_path, "broken", 'links = ["nfc", "can"]\n' + GOOD)
     (entry,) = list_profiles([tmp_path])
     assert listed(entry) == {
@@ -174,6 +178,16 @@ def test_a_broken_profile_is_listed_with_its_error(tmp_path: Path) -> None:
         "links": ["nfc", "can"],
         "channels": 1,
     }
+
+
+def test_a_file_that_is_removed_while_the_folder_is_listed_is_no_end_of_the_list(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone, good = tmp_path / "gone.toml", write(tmp_path, "good", GOOD)
+    monkeypatch.setattr(load, "_files", lambda _: [gone, good])
+    first, second = list_profiles([tmp_path])
+    assert (first.name, first.profile, first.error) == ("gone", None, f"There is no profile file {gone}.")
+    assert second.profile is not None
 
 
 def test_a_channel_of_a_type_as_data(tmp_path: Path) -> None:
@@ -622,6 +636,7 @@ def test_at_most_sixteen_profiles_extend_each_other(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_read_is_among_the_known_ones_and_a_base_is_not(tmp_path: Path) -> None:
     """Its name may be what was meant: the message about its content comes when it is asked for."""
     (tmp_path / "damaged.toml").write_bytes(b"abstract = true # \xff\n")
+    assert not _is_base(tmp_path), "a folder cannot be read"
     write(tmp_path, "base", f"abstract = true\n{GOOD}")
     write(tmp_path, "near", f"# abstract = true\n{GOOD}")
     with pytest.raises(NotFoundError) as refused:
