@@ -169,6 +169,14 @@ def test_every_vector_converts_or_says_why_not(name: str, edition: Any) -> None:
 # --- text-based TEDS ---
 
 
+def test_a_text_based_teds_whose_tedsid_is_not_first_is_not_converted() -> None:
+    decoded = teds.decode(frame(bytes.fromhex("0a0101 0304000b0101")))
+    assert (decoded.access_code, decoded.verdict) == (11, "content-nonconformant")
+    with pytest.raises(BadDataError) as refused:
+        teds.convert(decoded, 2024)
+    assert refused.value.message == "A text-based TEDS whose TEDSID is not first cannot be converted."
+
+
 def test_texts_are_read_by_their_lengths() -> None:
     octets = teds.compose(10, [("Text", {"LangCode": "en", "Text": "<a/>"}), ("Text", {"LangCode": "pt", "Text": "é"})])
     decoded = teds.decode(octets)

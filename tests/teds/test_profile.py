@@ -269,6 +269,10 @@ def test_a_uuid_of_the_wrong_length_and_a_foreign_channel_are_refused(tmp_path: 
         profile.build(UUID, calibration={2: fit([(0, 0.0), (1, 1.0)], "linear", channel=2)})
     assert refused.value.message == "The calibration is for channel 2; force has channel 1 only."
     assert refused.value.hint.endswith("or --no-calibration to drop the one that the node has.")
+    with pytest.raises(BadDataError, match=r"for channel 13; tactile-finger-sensor has channels 1 to 12\.$"):
+        load_profile("tactile-finger-sensor").build(
+            UUID, calibration={13: fit([(0, 0.0), (1, 1.0)], "linear", channel=13)}
+        )
     base = load_profile(write(tmp_path, "base", "abstract = true\n" + GOOD))
     with pytest.raises(BadDataError) as refused:
         base.build(UUID)
