@@ -28,6 +28,7 @@ from teds_provision.protocol.handover.revocation import open_revocation, seal_re
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.provisioning.agree import ResetReceipt
 from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft, KeyRecord, NodeRecord, WhitelistEntry
 from teds_provision.teds.image import Image
@@ -279,3 +280,15 @@ def test_a_spare_of_another_type_is_refused_by_its_last_reading(
     station.datasheets.keep_datasheet(Image(NEW, {(1, 3): b"channel"}))
     with pytest.raises(WrongBoardError, match=f"Channel 1 is in N, not in {more} was changed"):
         plan_takeover(station, OLD, NEW, copy_calibration=False)
+
+
+def test_a_ban_in_a_plant_is_judged_by_its_pages_which_may_have_lifted_it(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged: list[list[bytes]] = []
+    monkeypatch.setattr(type(station.plant.claims), "queue", lambda _claims, uuids: judged.append(list(uuids)))
+    statement = seal_revocation(SoftwareKey(42), uuid=OLD, node=None, why="lost", created=JANUARY)
+    station.plant.put_record(PlantRecord("11111111-2222-4333-8444-555555555555"))
+    for _ in range(2):
+        deny(station, statement, key=PIN)
+    assert judged == [[OLD]], "the first ban stays"

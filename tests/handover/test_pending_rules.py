@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError
+from teds_provision.handover.outgoing import _stale_before
 from teds_provision.handover.pending import (
     BundleNotes,
     ListedHandover,
@@ -20,6 +23,7 @@ from teds_provision.handover.pending import (
     find_handover,
     list_handovers,
     peer_name,
+    refused_in,
     signer_of,
     undo,
 )
@@ -307,3 +311,22 @@ def test_a_bundle_has_the_digest_of_its_nodes_in_ascending_order() -> None:
 
 def test_a_station_is_called_by_its_name_here_else_by_16_digits(station: Station, told: Events) -> None:
     assert [peer_name(station, digits) for digits in (TO_WEST, TO_SOUTH, "ab" * 32)] == ["west", "south", "ab" * 8]
+
+
+def test_whom_a_receipt_refuses_is_read_in_small_letters_and_nobody_of_none() -> None:
+    document = json.dumps({"refused": [{"uuid": A.hex().upper(), "why": "w"}]}).encode()
+    payload = base64.urlsafe_b64encode(document).rstrip(b"=").decode()
+    assert refused_in(f"head.{payload}.signature") == {A.hex()}
+    for none in ("", "no receipt", "head.!.signature"):
+        assert refused_in(none) == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("now", "stale"),
+    [(datetime(2026, 3, 2, tzinfo=UTC), ("s",)), (datetime(2027, 1, 1, tzinfo=UTC), (FILE,)), (None, ("s",))],
+)
+def test_which_files_of_a_bundle_no_receiver_takes_any_more(now: datetime | None, stale: tuple[str, ...]) -> None:
+    notes = BundleNotes((A.hex(),), "c", "04", "2026-03-08T08:00:00Z", (FILE,), created=AT, stale=("s",))
+    earlier: Any = SimpleNamespace(earlier=SimpleNamespace(nodes=notes.to_json()))
+    assert _stale_before(earlier, now) == stale
+    assert _stale_before(SimpleNamespace(earlier=None), now) == ()  # type: ignore[arg-type]

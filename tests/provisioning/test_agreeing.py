@@ -40,7 +40,7 @@ from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import KeyRecord, TrustRecord, WhitelistEntry
 from tests.bench import Board, make_station, talk
 
 from .test_provision import run as provisioned
@@ -392,3 +392,31 @@ def test_a_key_is_taken_up_if_nothing_of_before_is_left(
     monkeypatch.setattr(type(station.keys), "outdated", lambda *_: how["outdated"])
     record: Any = SimpleNamespace(uuid=bytes(10), state=how["state"], epoch=3)
     assert agreeing._is_taken_up(station, record) is taken_up
+
+
+@pytest.mark.parametrize("source", ["import", "agreement"])
+def test_epoch_and_sequence_of_a_bundle_are_replaced_by_those_of_the_session(
+    station: Station, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    uuid = bytes(9) + b"\1"
+    record = KeyRecord(uuid, 3, "ab" * 8, "pending", 1, b"w", source, "2026-01-01T00:00:00Z")  # type: ignore[arg-type]
+    station.keys.add(record)
+    corrected = replace(record, epoch=5)
+    activated: list[KeyRecord] = []
+    node: Any = SimpleNamespace(uuid=uuid, contact=SimpleNamespace(bus=None))
+    monkeypatch.setattr(agreeing, "without_source", lambda bus: bus)
+    monkeypatch.setattr(type(station.nodes), "met_at", lambda *_: None)
+    monkeypatch.setattr(agreeing, "read_identity", lambda _node: SimpleNamespace(epoch=5, sequence=9))
+    monkeypatch.setattr(
+        type(station.keys), "correct_epoch", lambda _keys, _record, epoch: replace(_record, epoch=epoch)
+    )
+    monkeypatch.setattr(agreeing, "_activate", lambda _station, used: activated.append(used))
+    found = agreeing._take_up(station, node, agreeing.NodeKey(record, bytes(16)))
+    known = station.nodes.get(uuid)
+    assert known is not None
+    log = [entry.detail for entry in station.audit_log.entries() if entry.outcome == "epoch corrected"]
+    if source == "import":
+        assert (found.record, activated, known.epoch, known.sequence) == (corrected, [corrected], 5, 9)
+        assert log == [{"key_id": "ab" * 8, "said": 3, "epoch": 5}]
+    else:
+        assert (found.record, activated, known.epoch, known.sequence, log) == (record, [record], 3, 0, [])

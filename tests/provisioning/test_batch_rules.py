@@ -877,3 +877,19 @@ def test_a_board_of_the_bus_is_meant_if_the_job_or_the_whitelist_lists_it(
                                          only_verify=only_verify, total=0))  # fmt: skip
     assert run._is_meant(answer(1)) is meant
     assert not run._is_meant(answer(2))
+
+
+def test_a_board_whose_row_cannot_be_given_for_any_reason_is_turned_away(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = of_sheet(station, tmp_path, "name\na\n")
+
+    def fail(*_: object) -> None:
+        raise UsageError("The name is none.")
+
+    monkeypatch.setattr(batch, "named_for", fail)
+    with pytest.raises(UsageError, match="The name is none"):
+        run._for(SimpleNamespace(uuid=uuid_of(1), fingerprint=KEY))  # type: ignore[arg-type]
+    assert run.progress is not None
+    assert run.progress.board_of(run.progress.sheet.rows[0]) == uuid_of(1).hex()
+    assert run.progress.rows[1].uuid is None

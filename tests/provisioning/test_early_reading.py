@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflictError
+from teds_provision.errors import AddressConflictError, NodeSilentError
 from teds_provision.links import LINKS, Contact, LinkSettings
 from teds_provision.links.ports import ContactSink, NoticeSink
 from teds_provision.protocol.messages.identity import NodeState
@@ -212,3 +212,24 @@ def test_a_board_that_has_a_key_is_not_read_early_nor_one_after_the_end() -> Non
     assert early.answers_of(keyed) is None
     assert early.answers_of(late) is None
     assert (frames(keyed), frames(late)) == (0, 0)
+
+
+def test_a_board_that_fails_early_ends_no_reading_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (at(number + 1, board) for number, board in enumerate(boards(2)))
+    begun: list[Contact] = []
+    goes_on = threading.Event()
+
+    def ask(one: Contact) -> Any:
+        begun.append(one)
+        if one is first:
+            goes_on.wait()
+            raise NodeSilentError("It is silent.")
+        return "answers"
+
+    monkeypatch.setattr(early_reading, "_ask", ask)
+    early = EarlyReading(at_once=1)
+    early.add(first)
+    early.add(second)
+    goes_on.set()
+    until(lambda: begun == [first, second])
+    assert [early.answers_of(one) for one in (first, second)] == [None, "answers"]

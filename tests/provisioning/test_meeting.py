@@ -513,3 +513,17 @@ def test_all_nodes_are_met_but_those_that_cannot_be_told_apart(monkeypatch: pyte
         assert [node.contact for node in nodes] == [other]
     assert port.calls == ["opened", {"seconds": 7.0, "notice": reporter.notice, "listen": 2.0}, "closed"]
     assert [found.link.closed for found in (one, twin, other)] == [0, 0, 1]  # type: ignore[attr-defined]
+
+
+def test_the_readers_are_stopped_when_the_caller_stops_or_one_of_them_fails() -> None:
+    def serve(*, stop: threading.Event, notice: object) -> Iterator[Contact]:
+        yield contact()
+        threading.Event.wait(stop)
+
+    ports: Any = [SimpleNamespace(place=f"nfc:{number}", watch=serve) for number in range(2)]
+    stop = threading.Event()
+    arrivals = meeting._together(ports, lambda _node: "done", SilentReporter(), stop)
+    assert next(arrivals).result == "done"
+    arrivals.close()  # type: ignore[attr-defined]
+    assert stop.is_set()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("nfc:")]

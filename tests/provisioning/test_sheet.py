@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -812,3 +813,11 @@ def test_a_row_in_the_order_of_taps_is_given_to_one_board_by_two_runs_of_a_sheet
     else:
         second.assign_row(row, board_of(2))
         assert Progress(station.home, sheet).board_of(row) == board_of(2).hex(), "the one with that key"
+
+
+def test_a_sheet_is_the_same_one_by_whatever_path_it_is_named(station: Station, tmp_path: Path) -> None:
+    sheet = read(station, tmp_path, "name\na\n")
+    (tmp_path / "link").symlink_to(tmp_path)
+    Progress(station.home, sheet).assign_row(sheet.rows[0], board_of(1))
+    again = Progress(station.home, replace(sheet, path=tmp_path / "link" / sheet.path.name))
+    assert again.board_of(sheet.rows[0]) == board_of(1).hex()

@@ -399,3 +399,13 @@ def test_the_vault_opens_before_a_node_is_waited_for_and_not_for_a_plan(
     for dry_run in (False, True):
         signing.sign_at(station, LinkSettings(), image.uuid.hex(), SilentReporter(), dry_run=dry_run)
     assert course == ["unlocked", "signed", "signed"]
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_a_calibration_that_was_accepted_is_in_the_log_unless_nothing_is_signed(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch, dry_run: bool
+) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(signing, "guard", lambda *words, **how: given.append((words[3], how)))
+    signing.sign_image(station, SignOrder(image.uuid, None, "a reason", dry_run), None)
+    assert given == [("a reason", {"record": not dry_run})]

@@ -1593,6 +1593,13 @@ def test_whatever_comes_of_the_restart_the_board_is_waited_for_until_its_old_ima
     assert (board.left, board.restarts, board.closed) == ([], 1, 1)
 
 
+def test_a_board_is_let_go_for_an_update_unless_the_caller_has_it() -> None:
+    let_go: list[Any] = []
+    station: Any = SimpleNamespace(released=lambda *given: let_go.append(given))
+    an_update(station)._release(bytes(10))
+    assert let_go == [(bytes(10), "update")]
+
+
 def test_a_plan_over_an_open_port_or_in_an_open_session_is_that_of_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
     none: Any = None
     order, planned = UpdateOrder(image_of(NEWER)), list[Any]()

@@ -167,3 +167,10 @@ def test_salt_and_iv_are_two_random_numbers(monkeypatch: pytest.MonkeyPatch) -> 
         pem = ca_file._encrypted_pem(b"der", "four random words")
     der = base64.b64decode("".join(pem.decode().splitlines()[1:-1]))
     assert [octets in der for octets in (b"a random number!", b"and another one!")] == [True, True]
+
+
+def test_an_empty_passphrase_is_a_wrong_one(tmp_path: Path) -> None:
+    write_ca(tmp_path / "ca.pem", bytes(31) + b"\7", "four random words")
+    with pytest.raises(WrongPassphraseError):
+        read_ca(tmp_path / "ca.pem", "")
+    assert read_ca(tmp_path / "ca.pem", "four random words") == bytes(31) + b"\7"
