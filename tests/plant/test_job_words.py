@@ -14,9 +14,10 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.cli.rendering import local_time as local
-from teds_provision.errors import UsageError
+from teds_provision.errors import PolicyError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.plant.commands import line as commands
+from teds_provision.plant.commands import provision as of_provision
 from teds_provision.plant.commands.provision import LineOptions
 from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import take_job
@@ -339,8 +340,16 @@ def test_the_status_of_a_job_as_a_table(home: Path, monkeypatch: pytest.MonkeyPa
     assert "\nwest, east: nothing received yet" in call(home, "job", "status", "abcd").out, "this station knows its own"
 
 
-def test_a_job_takes_no_datasheet_of_another_base(home: Path) -> None:
+def test_a_job_takes_no_datasheet_of_another_base(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def reached(*_: object) -> Any:
+        raise PolicyError("It goes on.")
+
     a_job(home)
+    with monkeypatch.context() as patch:
+        patch.setattr(of_provision, "options_given", lambda *_: set())
+        patch.setattr(of_provision.LineOptions, "begin", reached)
+        done = call(home, "--json", "provision", "--job", "abcd", "--adopt", "--nfc", "udp:localhost:9")
+        assert done.json["error"]["message"] == "It goes on.", "a setting is no order for this board"
     for words in (("--job", "abcd"), ("--job", "abcd", "--all")):
         refused = call(home, "--json", "provision", *words, "--adopt", "--nfc", "udp:localhost:9")
         assert (refused.code, refused.json["error"]["message"]) == (
