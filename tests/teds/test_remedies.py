@@ -44,7 +44,7 @@ def undated(folder: Path) -> object:
 
 def wrong_type(folder: Path) -> object:
     path = folder / "my type.toml"
-    path.write_text(GOOD.replace('"N"', '"qq"'))
+    path.write_text(GOOD.replace('"N"', '"]["'))
     return load_profile(path)
 
 
