@@ -22,7 +22,7 @@ from teds_provision.measure.matching import MatchSurvey
 from teds_provision.ncap.web.tokens import Token, Tokens
 from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
-from tests.pace import PATIENCE
+from tests.pace import PATIENCE, until
 
 from .shell import call
 
@@ -332,8 +332,11 @@ def test_of_lines_that_nobody_reads_the_oldest_go_and_are_counted(monkeypatch: p
     for number in range(1003):
         lines.write_event({"event": "node", "number": number})
     pipe.go.set()
+    until(lambda: pipe.getvalue().count("\n") == 1002)
+    lines.write_event({"event": "last"})
     assert lines.end()
-    written = pipe.getvalue().splitlines()
+    *written, last = pipe.getvalue().splitlines()
+    assert last == '{"event": "last"}', "what was dropped is counted once"
     assert len(written) == 1002
     assert written[0] == '{"event": "first"}'
     assert written[1] == '{"event": "lines", "state": "dropped", "count": 3}'
@@ -454,3 +457,12 @@ def test_a_part_of_an_optional_room_may_refuse_a_station(
     monkeypatch.setattr(commands.settings, "Settings", lambda **how: settings_of(**how | {"parts": ("b",)}))
     assert call(home, "ncap", "run").code == 0
     assert (asked, ran[0].parts) == (["b"], ("b",))
+
+
+def test_a_setting_for_unverified_nodes_counts_only_with_adopt(home: Path, ran: list[Any]) -> None:
+    """In config.toml it may stand for the days on which nodes are adopted."""
+    (home / "config.toml").write_text("[ncap.run]\nunverified = true\n")
+    assert call(home, "ncap", "run", "--can", "virtual:a").code == 0
+    assert ran[0].unverified is False
+    assert call(home, "ncap", "run", "--can", "virtual:a", "--adopt", "--detection", "transparent").code == 0
+    assert ran[1].unverified is True

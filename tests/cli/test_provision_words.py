@@ -15,6 +15,7 @@ import pytest
 
 from teds_provision import firmware_image, provisioning
 from teds_provision.cli.context import App
+from teds_provision.cli.node import verify
 from teds_provision.cli.rendering import firmware_words
 from teds_provision.errors import (
     NodeSilentError,
@@ -558,3 +559,48 @@ def test_a_terminal_shows_what_was_checked_as_a_table_in_colours(
         [f"{NODE}:", *skipped.verdict.split()],
         ["firmware:", *firmware_words(runs.to_json()).split()],
     ]
+
+
+@pytest.mark.parametrize(
+    ("facts", "text"),
+    [
+        ({"verified": GOOD}, f"authentic      {NODE}  a.json"),
+        ({"verified": GOOD, "warnings": ("It is old.", "It is odd.")},
+         f"authentic      {NODE}  a.json: It is old.; It is odd."),
+        ({"error": {"code": "bad-data", "message": "a\x1b[2J is torn.", "hint": ""}},
+         "unreadable     -                     a.json: a\ufffd[2J is torn."),
+    ],
+)  # fmt: skip
+def test_each_file_of_many_is_one_line_with_what_is_odd_about_it(facts: dict[str, Any], text: str) -> None:
+    assert verify._line(provisioning.verify_files.FileVerdict("a.json", **facts)) == text
+
+
+def test_the_verdicts_of_many_files_are_summed_by_name_and_the_worst_ends_the_command(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.json").write_text("{}")
+    totals = provisioning.verify_files.VerdictTotals
+    parts = [(["one"], totals()), (["two", "three"], totals())]
+    parts[0][1].verdicts.update({"unsigned": 1})
+    parts[1][1].verdicts.update({"authentic": 2})
+    parts[0][1].exit_code = 4
+    monkeypatch.setattr(provisioning.verify_files, "verify_files", lambda _station, _files, _line: iter(parts))
+    done = call(home, "verify", tmp_path)
+    assert done.code == 4
+    assert done.out.splitlines()[:3] == ["one", "two", "three"]
+    assert done.out.splitlines()[3].endswith(": 2 authentic, 1 unsigned.")
+
+
+def test_several_names_are_files_whatever_link_is_named_and_an_empty_reason_is_one(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many: list[Any] = []
+    monkeypatch.setattr(verify, "verify_many", lambda _app, what: many.append(what))
+    assert call(home, "verify", "a.json", "b.json", *NFC).code == 0
+    assert many == [("a.json", "b.json")]
+    refused = call(home, "--json", "verify", tmp_path, "--accept-calibration", "")
+    assert (refused.code, refused.json["error"]["message"]) == (
+        2,
+        "--accept-calibration applies to a single image.",
+    )

@@ -545,6 +545,20 @@ PATTERNS = (
         "tests/describe/test_documents.py",
     ),
     Pattern(
+        "several names to verify are files whatever link is named",
+        "verify",
+        'len(what) == 1 and bool(options_given("via", "nfc", "can", "ble"))',
+        'bool(options_given("via", "nfc", "can", "ble"))',
+        "tests/cli/test_provision_words.py",
+    ),
+    Pattern(
+        "a setting for unverified nodes counts only with adopt",
+        "run",
+        'wished["unverified"] and wished["adopt"]',
+        'wished["unverified"]',
+        "tests/cli/test_ncap_words.py",
+    ),
+    Pattern(
         "a time of a recording is one of the years 1970 to 2540",
         "Recording._checked",
         "(entry.time >= 0) & (entry.time <= _LATEST)",
