@@ -354,3 +354,23 @@ def test_a_thread_that_has_ended_leaves_the_others_to_be_placed() -> None:
     run.kernel.place = gone  # type: ignore[method-assign]
     assert run.look() == 0
     assert run.kernel.places == {1: {0}, 7: {0}}
+
+
+def test_a_block_within_a_block_changes_nothing() -> None:
+    with one_core(StatedKernel()) as outer, one_core(StatedKernel()) as inner:
+        assert (outer is None, inner) == (False, None)
+    with one_core(StatedKernel()) as again:
+        assert again is not None
+
+
+def test_a_thread_that_has_started_its_process_is_moved_with_the_others_again() -> None:
+    own = threading.get_native_id()
+    run = Run(StatedKernel(started=[1, own]))
+    assert run.look() == 0
+    with run.kept.on_every_core():
+        run.kernel.places[1] = frozenset({0})  # as another thread sees it, which looks
+        assert run.look(others={0: 1.4}) == 1
+        assert run.kernel.places[own] == {0}, "not while it starts one"
+    assert run.look(others={1: 1.4}) == 0
+    assert run.look(others={0: 1.4}) == 1
+    assert run.kernel.places[own] == {1}

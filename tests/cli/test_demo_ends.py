@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -384,3 +384,37 @@ def test_a_node_of_the_story_ends_with_its_block_and_is_killed_if_it_does_not(
         ("wait", 5.0),
         *([] if ends else ["kill", ("wait", None)]),
     ]
+
+
+def test_both_nodes_of_the_story_are_measured_as_one_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[Any] = []
+    gripper = bytes(range(10))
+    monkeypatch.setattr(story, "calibrations", lambda _folder: {"gripper": "g.toml", "angle": "a.csv"})
+    monkeypatch.setattr(story, "virtual_node", lambda _demo, *words: nullcontext(gripper))
+    for name in ("provision_gripper", "calibrate_sensor", "measure_group", "move_gripper"):
+        monkeypatch.setattr(story, name, lambda _demo, _station, *words, name=name: course.append((name, *words)))
+    demo = demo_in(tmp_path, stack=ExitStack())
+    story._measure(demo, None)  # type: ignore[arg-type]
+    assert course == [
+        ("provision_gripper", gripper, "g.toml"),
+        ("calibrate_sensor", "a.csv"),
+        ("measure_group", (demo.uuid, gripper)),
+        ("move_gripper", gripper),
+    ]
+
+
+@pytest.mark.parametrize("mode", [0o700, 0o755])
+def test_the_folder_of_a_demo_has_its_mode_and_is_gone_however_it_ends(mode: int) -> None:
+    closed: list[str] = []
+    folders: list[Path] = []
+
+    def fail() -> None:
+        with story.temporary_demo(SilentReporter(), lambda _text: None, mode=mode) as demo:
+            folders.append(demo.folder)
+            assert demo.folder.stat().st_mode & 0o777 == mode
+            demo.stack.callback(lambda: closed.append(str(demo.folder.exists())))
+            raise LinkError("The story fails.")
+
+    with pytest.raises(LinkError):
+        fail()
+    assert (closed, folders[0].exists()) == (["True"], False)

@@ -57,5 +57,12 @@ def test_names_types_and_defaults_of_all_options_are_those_that_scripts_know() -
     assert list(lines()) == KEPT.read_text(encoding="utf-8").splitlines()
 
 
+def test_every_option_is_shown_in_help() -> None:
+    every = (("", cli), *commands(cli))
+    assert [
+        path for path, command in every for parameter in command.params if getattr(parameter, "hidden", False)
+    ] == []
+
+
 if __name__ == "__main__":
     KEPT.write_text("\n".join(lines()) + "\n", encoding="utf-8")

@@ -559,6 +559,20 @@ PATTERNS = (
         "tests/cli/test_ncap_words.py",
     ),
     Pattern(
+        "a block within a block keeps to no core of its own",
+        "one_core",
+        "None if _IN_FORCE else _keep(kernel or LinuxKernel())",
+        "_keep(kernel or LinuxKernel())",
+        "tests/test_one_core.py",
+    ),
+    Pattern(
+        "a thread that started a process is moved with the others again",
+        "OneCore.on_every_core",
+        "self._elsewhere.discard(thread)",
+        "None",
+        "tests/test_one_core.py",
+    ),
+    Pattern(
         "a time of a recording is one of the years 1970 to 2540",
         "Recording._checked",
         "(entry.time >= 0) & (entry.time <= _LATEST)",
