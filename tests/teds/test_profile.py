@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
+import os
 import re
 import tomllib
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -156,6 +159,25 @@ def test_a_profile_is_found_by_name_in_the_users_folders_first(tmp_path: Path, m
     listed = {entry.name: entry for entry in list_profiles(folders)}
     assert listed["load-cell"].path.resolve() == mine.resolve()
     assert "gripper" in listed
+
+
+def test_a_profile_that_may_not_be_read_is_listed_with_its_error_beside_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, "arm", GOOD)
+    write(tmp_path, "locked", GOOD)
+    opened = os.open
+
+    def refused(path: Any, *words: Any, **more: Any) -> int:
+        if str(path).endswith("locked.toml"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, *words, **more)
+
+    monkeypatch.setattr(os, "open", refused)
+    good, locked = list_profiles([tmp_path])
+    assert good.profile is not None
+    assert (locked.name, locked.profile) == ("locked", None)
+    assert "locked.toml" in locked.error
 
 
 def test_a_broken_profile_is_listed_with_its_error(tmp_path: Path) -> None:

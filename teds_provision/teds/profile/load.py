@@ -173,7 +173,7 @@ def list_profiles(folders: Sequence[Path] | None = None) -> list[ListedProfile]:
             continue
         try:
             profile, error = load_profile(path, places), ""
-        except (BadDataError, NotFoundError) as failure:
+        except (BadDataError, NotFoundError, StoreError) as failure:  # StoreError: it may not be read
             profile, error = None, failure.message
         found[path.stem] = ListedProfile(path.stem, path, profile, error)
     return [found[name] for name in sorted(found)]
