@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -358,6 +359,9 @@ def test_explain_names_an_agreement_that_is_never_confirmed(
     assert isinstance(explanation, ExplainedRequest)
     assert (len(explanation.transcript), len(explanation.okm), len(explanation.confirmation_key)) == (32, 48, 32)
     assert explanation.tag_due == explanation.reply[85:101]
+    key, script = explanation.confirmation_key, explanation.transcript
+    assert explanation.tag_due == hmac.digest(key, b"node" + script, "sha256")[:16]
+    assert explanation.station_tag == hmac.digest(key, b"station" + script, "sha256")[:16]
     assert not explanation.problem
     assert board.state == before
     assert station.identity.point not in explanation.request, "a stranger asks, whose keys are for this one question"

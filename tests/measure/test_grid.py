@@ -33,6 +33,17 @@ def test_a_row_holds_the_last_value_that_is_not_newer_and_its_age() -> None:
     np.testing.assert_allclose(got.age[:10, 1], [0, 0.01, 0.02, 0.03, 0.04] * 2, atol=1e-6)
 
 
+def test_a_stream_that_comes_with_other_channels_fills_the_columns_of_these() -> None:
+    other = replace(ANGLE, number=2, name="other")
+    for channels, values in (((2,), [[5]]), ((2, 1), [[5, 6]])):
+        grid = Grid("g", [ANGLE, other], patience=0.0)
+        grid.add_block(block([[1]]))
+        assert rows(grid, NOW + 0.005).value[-1].tolist()[0] == 0.1
+        grid.add_block(block(values, channels=channels, start=NOW + 0.01))
+        last = rows(grid, NOW + 0.015).value[-1].tolist()
+        np.testing.assert_equal(last, [np.nan if len(channels) == 1 else 0.6, 0.5])
+
+
 def test_after_two_periods_a_value_is_no_value() -> None:
     grid = Grid("g", [ANGLE], patience=0.0)
     grid.add_block(block([[7]]))

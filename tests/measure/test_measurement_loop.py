@@ -49,6 +49,17 @@ def test_a_sink_that_waits_for_its_consumers_is_news_after_three_seconds_each_ti
     assert [Measurement._is_news(loop, sink) for _ in range(2)] == [True, False]
 
 
+def test_each_sink_with_news_is_shown_and_each_node_is_reported_at_a_look() -> None:
+    shown: list[str] = []
+    news = {"first": False, "second": True, "third": True}
+    loop: Any = SimpleNamespace(
+        supervisors=[SimpleNamespace(report=lambda: "arm"), SimpleNamespace(report=lambda: "hand")],
+        sinks=list(news), _report=shown.append, _is_news=news.__getitem__, watcher=SimpleNamespace(sink=shown.append),
+    )  # fmt: skip
+    Measurement._look(loop)
+    assert shown == ["arm", "hand", "second", "third"]
+
+
 def test_a_recorder_is_news_as_soon_as_it_waits_and_for_each_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurement, "time", SimpleNamespace(monotonic=lambda: 0.0))
     loop: Any = SimpleNamespace(_waits={}, _shown={})

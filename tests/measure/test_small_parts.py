@@ -215,6 +215,15 @@ def test_a_locked_vault_is_reported_once_while_it_is_waited_for(monkeypatch: pyt
     assert [(report.state, report.why) for report in reports] == [("waiting", "Another command changes the master key")]
 
 
+def test_only_a_measurement_that_is_patient_waits_for_a_locked_vault(monkeypatch: pytest.MonkeyPatch) -> None:
+    reports: list[Any] = []
+    made = _supervisor(reports, patient=False)
+    unlock = SimpleNamespace(unlock=lambda _uuid: pytest.fail("the next try says that the vault is locked"))
+    monkeypatch.setattr(made, "_station", unlock)
+    made._wait_for_vault()
+    assert reports == []
+
+
 def test_a_reason_stands_in_a_sentence_without_its_full_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     for error, why in ((PolicyError("It is banned."), "It is banned"), (NotAuthenticError("No."), "No"), (None, "")):
 

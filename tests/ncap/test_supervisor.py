@@ -28,7 +28,7 @@ from teds_provision.errors import (
 from teds_provision.links.discovery import Sighting
 from teds_provision.measure.blocks import InvalidValues, NodeReport
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.matching import NodeLoad, NodeMatch
+from teds_provision.measure.matching import NodeLoad, NodeMatch, UnsignedNodes
 from teds_provision.ncap import measurement_supervisor
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, NodeLoan
@@ -245,6 +245,24 @@ def test_a_node_that_had_just_arrived_when_a_measurement_ends_is_given_back(serv
     running.membership.arrive(NODE, 0.0)
     service.measurements._finish(running)
     assert service.locks.holder(NODE) is None
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_node_that_is_signed_leaves_the_unverified_ones_with_its_reason(
+    service: Service, monkeypatch: pytest.MonkeyPatch, measured: bool
+) -> None:
+    """It is lent for the block, and given back then."""
+    whys = list[str]()
+    supervisor: Any = SimpleNamespace(stop=lambda why="": whys.append(why))
+    members = {NODE if measured else OTHER: Member(supervisor=supervisor)}
+    running: Any = SimpleNamespace(membership=SimpleNamespace(members=members, has=lambda _uuid: False), deleted=False)
+    monkeypatch.setitem(service.measurements._running, UnsignedNodes.text, running)
+    returned = list[NodeLoan]()
+    monkeypatch.setattr(service.measurements, "return_node", returned.append)
+    with service.measurements.unmeasured(NODE, "let go for provision"):
+        assert returned == []
+    assert whys == (["let go for provision"] if measured else [])
+    assert [(loan.uuid, loan.why) for loan in returned] == [(NODE, "let go for provision")]
 
 
 def listed(service: Service, *uuids: str) -> RunningMeasurement:

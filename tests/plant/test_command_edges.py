@@ -634,6 +634,10 @@ def test_an_office_signs_for_so_many_seconds_and_prints_a_line_each(
         {**west, "sequence": 7}, {**west, "refused": "full", "why": "the unit is full"},
         {**west, "from": "ab" * 32, "sequence": 7},
     ]  # fmt: skip
+    tries[:] = [set()] * 7
+    timers.clear()
+    assert call(home, "signer", "run", "--job", "0b5f", "--for", "0").code == 0
+    assert [seconds for seconds, _ in timers] == [0], "no time is none: what waits is answered, and it ends"
 
 
 @pytest.mark.parametrize("by_folder", [True, False])

@@ -331,6 +331,15 @@ def test_a_one_time_key_is_for_one_request_and_e_is_no_static_key() -> None:
     assert reason_of(desk, request(one_time=STATION.point)) == Reason.BAD_POINT
 
 
+@pytest.mark.parametrize(("asked", "reset"), [("nfc", "can:f1"), ("can:f1", "nfc")])
+def test_a_reset_on_another_link_ends_a_pending_agreement_too(asked: str, reset: str) -> None:
+    desk = Desk()
+    confirm = half_way(desk, link=asked).confirm
+    assert desk.plain(security_command(Function.RESET, bytes(32)), link=reset).ok
+    assert desk.plain(confirm, link=asked) == refusal(Reason.WRONG_STATE)
+    assert desk.flash.key is None
+
+
 @pytest.mark.parametrize("by", ["command", "hand"])
 def test_a_reset_ends_a_pending_agreement_in_factory_state_too(by: str) -> None:
     desk = Desk()

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from datetime import date
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.station.datasheets import packed, unpacked
+from teds_provision.station.datasheets import _first_due, packed, unpacked
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft, NodeReading, NodeRecord
 from teds_provision.teds.image import Image
@@ -155,3 +157,14 @@ def test_a_node_costs_little_in_the_file(station: Station) -> None:
 
     assert keep(0) <= 5000
     assert max(keep(version) for version in range(1, 4)) <= 2048
+
+
+@pytest.mark.parametrize("ends", [("2027-03-01", "2026-12-24"), ("2026-12-24", "2027-03-01"), ("2026-12-24", None)])
+def test_a_datasheet_is_due_when_the_first_of_its_calibrations_ends(
+    monkeypatch: pytest.MonkeyPatch, ends: tuple[str | None, ...]
+) -> None:
+    channels = [SimpleNamespace(due=None if day is None else date.fromisoformat(day)) for day in ends]
+    sheet = SimpleNamespace(from_image=lambda _image: SimpleNamespace(channels=channels))
+    monkeypatch.setattr("teds_provision.station.datasheets.teds", SimpleNamespace(sheet=SimpleNamespace(Sheet=sheet)))
+    assert _first_due(Image(bytes(10), {(1, 5): b"a calibration"})) == "2026-12-24"
+    assert _first_due(Image(bytes(10), {(1, 3): b"no calibration"})) is None

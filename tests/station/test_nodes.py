@@ -176,3 +176,10 @@ def test_ten_thousand_nodes_are_quick_to_find(station: Station) -> None:
     assert station.nodes.resolve("aa" + (9998).to_bytes(9, "big").hex()[:-1] + "e") == b"\xaa" + (9998).to_bytes(
         9, "big"
     )
+
+
+def test_a_node_was_met_last_at_the_place_of_its_last_meeting(station: Station) -> None:
+    first, second = bytes(10), bytes([1]) * 10
+    for uuid, place in ((first, "can:a"), (second, "can:a"), (first, "ble:hci0"), (first, "")):
+        station.nodes.met_at(uuid, place)
+    assert station.nodes.last_places([first, second]) == {first: "ble:hci0", second: "can:a"}

@@ -591,6 +591,9 @@ def test_a_certificate_is_shown_whole() -> None:
     (item,) = shown.items
     assert item.title == "Points of channel 1: 4 points, Raw value [plain numbers] and Reference value [°]"
     assert points_of(item)[0] == ("400", "2.1")
+    raws, values = listed("measuredValue", "400.25 500", r"\one"), listed("referenceValue", "80.0125 90")
+    (fine,) = items_of(read(table(raws, values)))
+    assert points_of(fine)[0] == ("400.25", "80.0125"), "as the certificate gives them"
     many = " ".join(map(str, range(51)))
     (long,) = items_of(read(table(listed("measuredValue", many, r"\one"), listed("referenceValue", many))))
     rows = points_of(long)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from tests.teds.strategies import some_fields
 from tests.teds.vectors import TEDS, octets_of
@@ -125,6 +126,15 @@ def test_classes_that_2007_does_not_have() -> None:
     assert "class" in {finding.code for finding in findings}
     assert decoded.get("Level") == "E"
     assert "class" not in {finding.code for finding in to(octets_of("x24_security"), 2024)[1]}
+
+
+@pytest.mark.parametrize("code", [AccessCode.SECURITY, AccessCode.ORIGIN, AccessCode.CERTIFICATE])
+def test_a_teds_of_the_profile_has_the_same_octets_in_each_edition(code: AccessCode) -> None:
+    octets = frame(bytes.fromhex(f"03 04 00 {code:02x} 01 01 0a 01 61"))
+    for edition, codes in ((2007, []), (2024, ["one-form"])):
+        converted, findings = to(octets, edition)
+        assert converted.octets == octets
+        assert [finding.code for finding in findings] == codes
 
 
 def test_the_security_teds_of_the_profile_has_one_form() -> None:

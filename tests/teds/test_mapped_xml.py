@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from teds_provision.errors import BadDataError
+from teds_provision.teds.formats import mapped
 from teds_provision.teds.formats.mapped import profile_from_xml
 from teds_provision.teds.profile.load import parse_profile
 
@@ -61,6 +63,14 @@ type = "range/high"
 type = "overlaid"
 sample = { model = "unsigned", octets = 2 }
 """
+
+
+@pytest.mark.parametrize("text", ['a", octets = "4', "C:\\temp", "tab\there", "\x7f", "é ✓", "]\n[x]"])
+def test_a_text_of_the_laboratory_stays_one_text(text: str) -> None:
+    """As a value of the file and inside a table of one line; it adds no key, whatever is in it."""
+    assert tomllib.loads(f"title = {mapped._toml(text)}\n") == {"title": text}
+    sample = {"model": text, "octets": 2}
+    assert tomllib.loads(f"sample = {mapped._toml(sample)}\n") == {"sample": sample}
 
 
 def test_the_text_that_is_made_whole() -> None:

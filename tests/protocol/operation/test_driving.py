@@ -183,6 +183,23 @@ def test_a_new_drive_replaces_the_one_before(wheel: Wheel) -> None:
     assert wheel.points == (1001, 1001), "a refused one changes nothing"
 
 
+def test_a_new_drive_counts_from_the_start_and_forgets_what_the_old_one_had_begun(wheel: Wheel) -> None:
+    """Counters are those of a run: the first message of the new one is no replay of the old one's."""
+    from teds_provision.protocol.operation.can_frames import cut
+
+    for value in (2000, 2100):
+        wheel.hear(wheel.message(value, value))
+    begun, *rest = cut(wheel.message(2200, 2200), fd=False, drive=True)
+    wheel.bench.tim.drive("can:f1", begun.data)
+    again = Wheel(wheel.bench)
+    assert clock(wheel.bench).last == NONE
+    for piece in rest:
+        wheel.bench.tim.drive("can:f1", piece.data)
+    assert wheel.points == (2100, 2100)
+    again.hear(again.message(1000, 1000))
+    assert (wheel.points, clock(wheel.bench).last) == ((1000, 1000), 0)
+
+
 def test_frames_of_a_drive_message_out_of_order_move_nothing(wheel: Wheel) -> None:
     from teds_provision.protocol.operation.can_frames import cut
 

@@ -163,6 +163,8 @@ def test_data_sets_in_the_order_of_section_2() -> None:
             ("write of another width", write_data_set(4, b"\0"), U.BAD_FORM),
             ("write of another width, not claimed", write_data_set(6, b"\0"), U.BAD_FORM),
             ("write to one not claimed", write_data_set(6, TOO_MUCH), U.WRONG_STATE),
+            ("write to a sensor that is not claimed", write_data_set(2, bytes(2)), U.WRONG_STATE),
+            ("set of a sensor that is not claimed", set_values([(2, bytes(2))]), U.WRONG_STATE),
             ("write to a sensor, at offset 1", R(1, 3, 2, b"\0\0\0\1\0\0"), U.NOT_PERMITTED),
             ("write at offset 1", R(4, 3, 2, b"\0\0\0\1" + GOOD_VALUE), U.OUT_OF_RANGE),
             ("write past the hardware, which is faulty", write_data_set(4, TOO_MUCH), U.OUT_OF_RANGE),
