@@ -89,7 +89,8 @@ def test_who_is_there_and_who_answers_whom(floor: Floor) -> None:
     first = station.raw(frame)
     assert station.raw(frame, again=True) == first
     refused(13, lambda: station.payload(station.raw(frame), True))
-    broken = station.sealed(station.command(0, 128, 19))[:-1] + b"\0"
+    sealed = station.sealed(station.command(0, 128, 19))
+    broken = sealed[:-1] + bytes([sealed[-1] ^ 1])
     refused(12, lambda: station.payload(station.raw(broken), True))
     assert station.states()[0] == 0, "a bad frame ends nothing"
 

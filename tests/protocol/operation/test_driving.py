@@ -124,7 +124,8 @@ def test_a_drive_message_that_moves_nothing_feeds_no_dead_man(wheel: Wheel, wron
         case "too far ahead":
             wheel.hear(wheel.message(2000, 2000, now=bench.hardware.tick + 501 * MS, hold=1 * MS))
         case "forged":
-            wheel.hear(wheel.message(2000, 2000)[:-1] + b"x")
+            forged = wheel.message(2000, 2000)
+            wheel.hear(forged[:-1] + bytes([forged[-1] ^ 1]))
         case "beyond the hardware":
             wheel.hear(wheel.message(2000, 4001))
         case "fault":
