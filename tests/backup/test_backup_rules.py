@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
-from teds_provision.backup.backup import backup
+from teds_provision.backup.backup import _write, backup
 from teds_provision.backup.content import BackupHead
 from teds_provision.backup.restore import rebuild
 from teds_provision.errors import PolicyError, StoreError, StoreLockedError, UsageError
@@ -126,3 +129,36 @@ def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(
         assert not (tmp_path / "b").exists()
         other.execute("ROLLBACK")
     assert back_up(station, tmp_path / "b").nodes == 2
+
+
+def test_what_a_change_of_the_vault_made_useless_is_written_over_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The secrets are those of the vault as it is now, and the head names no path of a module."""
+    course, heads = list[str](), list[BackupHead]()
+    written, changed = [b"the first try, which is longer", b"whole"], [False, True, False, False]
+
+    def refresh() -> bool:
+        course.append("refresh")
+        return changed.pop(0)
+
+    def secrets() -> str:
+        course.append("secrets")
+        return "material"
+
+    def write(file: io.BytesIO, head: BackupHead, rows: object, identity: object, sealer: object) -> bytes:
+        course.append(f"{rows} {identity} {sealer}")
+        heads.append(head)
+        file.write(written.pop(0))
+        return b"key"
+
+    monkeypatch.setattr("teds_provision.backup.backup.write", write)
+    vault: Any = SimpleNamespace(refresh=refresh, secret_material=secrets, identity=lambda: "identity")
+    identity = SimpleNamespace(keystore="pkcs11:token=x?module-path=/x.so")
+    station: Any = SimpleNamespace(identity=identity, id="id", point=POINT, name="n", rows=lambda: "rows")
+    file, sealer = io.BytesIO(), cast("Any", "sealer")
+    assert _write(station, vault, file, sealer) == b"key"
+    assert file.getvalue() == b"whole"
+    assert course == ["refresh", "secrets", "rows identity sealer", "refresh"] * 2
+    assert [(head.keystore, head.material) for head in heads] == [("pkcs11", "material")] * 2
+    identity.keystore, changed[:], written[:] = "file", [True, False], [b"once"]
+    _write(station, vault, io.BytesIO(), sealer)
+    assert (heads[-1].keystore, changed, written) == ("file", [], [])

@@ -415,12 +415,13 @@ def test_names_and_frames_of_a_node_that_is_measured_stay_as_they_are(two: Two, 
     assert (two.live.measurements.frames[A, 0], two.live.measurements.frames[B, 1]) == ("tool0", "tool1")
 
 
-def test_a_frame_that_both_have_is_that_of_a_newer_copy_alone(two: Two) -> None:
-    two.live.measurements.set_frame(A, 0, "here")
-    two.copy.measurements.set_frame(A, 0, "there")
-    for how, frame in ((OLDER, "here"), (OTHER, "here"), (NEWER, "there")):
+def test_a_name_and_a_frame_that_both_have_are_those_of_a_newer_copy_alone(two: Two) -> None:
+    for store, word in ((two.live, "here"), (two.copy, "there")):
+        store.measurements.rename(A, 0, word)
+        store.measurements.set_frame(A, 0, word)
+    for how, word in ((OLDER, "here"), (OTHER, "here"), (NEWER, "there")):
         two.merged(how)
-        assert two.live.measurements.frames == {(A, 0): frame}
+        assert two.live.measurements.names == two.live.measurements.frames == {(A, 0): word}
 
 
 @pytest.mark.parametrize(

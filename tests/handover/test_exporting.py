@@ -8,11 +8,14 @@ import stat
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision.cli.station.handover import import_text
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
+from teds_provision.handover import outgoing
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import (
     ExportOrder,
@@ -27,7 +30,7 @@ from teds_provision.handover.outgoing import (
     seal_export,
 )
 from teds_provision.handover.pending import BundleNotes, close, find_handover, undo
-from teds_provision.protocol.handover.bundle import open_bundle
+from teds_provision.protocol.handover.bundle import BundledNode, open_bundle
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.plant import PlantRecord
@@ -289,3 +292,29 @@ def test_every_note_about_every_accepted_node_is_in_the_plan_of_an_import(pair: 
     assert [line for line in lines if line.startswith(f"  {uuid}: ")] == [
         f"  {uuid}: Its name is taken.", f"  {uuid}: Its group is measured.",
     ] * 2  # fmt: skip
+
+
+def test_a_node_whose_row_point_or_key_is_gone_does_not_leave() -> None:
+    one, two = bytes(9) + b"\1", bytes(9) + b"\2"
+    whole = SimpleNamespace(point=b"point", sequence=9, profile="p", name="n", groups=("hand",), teds_sha256="ab" * 32)
+    records: dict[bytes, Any] = {one: whole, two: whole}
+    keys: dict[bytes, Any] = {one: (3, b"k" * 16), two: (0, b"l" * 16)}
+    station: Any = SimpleNamespace(
+        nodes=SimpleNamespace(exported_many=lambda uuids: {uuid: records[uuid] for uuid in uuids if uuid in records}),
+        keys=SimpleNamespace(unwrap_named=lambda named: {uuid: keys[uuid] for uuid in named if uuid in keys}),
+    )
+    nodes = [outgoing.LeavingNode(one, "a1", 3), outgoing.LeavingNode(two, "b1", 0)]
+    assert list(outgoing._bundled(station, nodes)) == [
+        BundledNode(one, b"point", b"k" * 16, 3, 9, "p", "n", ("hand",), "ab" * 32),
+        BundledNode(two, b"point", b"l" * 16, 0, 9, "p", "n", ("hand",), "ab" * 32),
+    ]
+    for change in (
+        lambda: records.update({two: SimpleNamespace(**{**vars(whole), "point": None})}),
+        lambda: records.pop(two),
+        lambda: (records.update({two: whole}), keys.pop(two)),
+    ):
+        change()
+        bundled = outgoing._bundled(station, nodes)
+        assert next(bundled).uuid == one
+        with pytest.raises(PolicyError, match=rf"^Node {two.hex()} was changed in the meantime\.$"):
+            next(bundled)

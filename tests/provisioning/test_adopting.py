@@ -315,6 +315,7 @@ def test_texts_of_several_lines_are_text_and_a_channel_may_lack_a_name(station: 
         ("4711", False),
         ("0x4711", False),
         ("4711ABCD", False),
+        ("0X4711", False),
         ("4712", True),
         ("0badc", True),
         ("xyz4711", True),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import getpass
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -893,3 +893,37 @@ def test_a_board_whose_row_cannot_be_given_for_any_reason_is_turned_away(
     assert run.progress is not None
     assert run.progress.board_of(run.progress.sheet.rows[0]) == uuid_of(1).hex()
     assert run.progress.rows[1].uuid is None
+
+
+@pytest.mark.parametrize("how", ["locked", "closed"])
+def test_a_batch_that_is_cut_short_writes_its_report_of_the_boards_until_then(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    run = of_sheet(station, tmp_path, "name\na\nb\n", report=tmp_path / "day.csv")
+    noted: list[BoardResult] = []
+
+    def come(_operator: Operator) -> Iterator[BoardResult]:
+        yield BoardResult(uuid_of(1), 1.0, row=1)
+        raise VaultLockedError("The vault is locked.")
+
+    monkeypatch.setattr(batch, "_load_ahead", lambda: None)
+    monkeypatch.setattr(run, "_as_they_come", come)
+    monkeypatch.setattr(run, "_note", noted.append)
+    boards = cast("Generator[BoardResult]", run.many(Operator()))
+    assert [next(boards)] == noted, "noted before anybody sees it"
+    assert not (tmp_path / "day.csv").exists()
+    if how == "locked":
+        with pytest.raises(VaultLockedError):
+            next(boards)
+    else:
+        boards.close()
+    assert (tmp_path / "day.csv").read_text().startswith("row,uuid,name,")
+
+
+def test_of_many_rows_without_a_board_the_first_ten_are_named(station: Station, tmp_path: Path) -> None:
+    rows = "".join(f"{uuid_of(number).hex()}\n" for number in range(1, 12))
+    run = of_sheet(station, tmp_path, f"uuid\n{rows}", whole_bus=True)
+    run._all_done = True
+    found = run.totals().error
+    assert found is not None
+    assert found.message.endswith("No board answered on the bus for row 1, 2, 3, 4, 5, 6, 7, 8, 9, 10.")

@@ -395,6 +395,8 @@ LABEL_KEY = "ab" * 32
         ("name\n" + "x\n" * 3 + "y\n", "boards.csv:3, 4: the name x is already in line 2."),
         ("profile\nnone\n", "boards.csv:2: There is no profile"),
         ("uuid\n" + "".join(f"{n}\n" for n in range(22)), "; and 2 more."),
+        ("uuid\n" + "".join(f"{n}\n" for n in range(20)), "; boards.csv:21: uuid: expected 20 hex digits, not '19'."),
+        ("uuid\nä\n", "boards.csv:2: uuid: expected 20 hex digits, not '\\xe4'."),
     ],
 )
 def test_each_mistake_in_a_sheet_is_named_with_its_line(

@@ -409,3 +409,30 @@ def test_a_calibration_that_was_accepted_is_in_the_log_unless_nothing_is_signed(
     monkeypatch.setattr(signing, "guard", lambda *words, **how: given.append((words[3], how)))
     signing.sign_image(station, SignOrder(image.uuid, None, "a reason", dry_run), None)
     assert given == [("a reason", {"record": not dry_run})]
+
+
+@pytest.mark.parametrize(("sheet", "record"), [(70_000, 5), (5, 70_000)])
+def test_the_numbers_of_a_node_are_the_highest_of_its_datasheet_its_record_and_the_file(
+    station: Station, monkeypatch: pytest.MonkeyPatch, sheet: int, record: int
+) -> None:
+    uuid = bytes(9) + b"\x08"
+    station.nodes.remember(uuid, epoch=7, sequence=record)
+    shown = SimpleNamespace(key_epoch=3, signed=True, station_key=b"another", sequence=70_001)
+    monkeypatch.setattr(signing.security, "decode", lambda _octets: shown)
+    monkeypatch.setattr(signing, "_sequence_of", lambda _image: sheet)
+    file = Image(uuid, {SECURITY: b"x"})
+    present = signing._last_known(station, uuid, None, file)
+    assert (present.epoch, present.sequence) == (7, 70_001)
+    shown.sequence = 4
+    assert signing._last_known(station, uuid, None, file).sequence == sheet
+
+
+def test_a_plan_of_a_signature_needs_no_entry_of_the_whitelist_and_has_the_reason_that_was_given(
+    station: Station, image: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders: list[SignOrder] = []
+    monkeypatch.setattr(signing, "sign_image", lambda _station, order, _node: orders.append(order))
+    station.pins.remove(image.uuid)
+    how: dict[str, Any] = {"accept_calibration": "a new cell", "dry_run": True}
+    signing.sign_at(station, LinkSettings(), image.uuid.hex(), SilentReporter(), **how)
+    assert orders == [SignOrder(image.uuid, None, "a new cell", True)]

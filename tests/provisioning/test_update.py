@@ -1261,6 +1261,7 @@ def test_each_thing_that_a_new_image_proves_is_looked_at(
         made._prove(none, manager, before)
     assert ("confirm" in did) == (error == "did not keep")
     assert "keep 02" not in did
+    assert "hardware" not in did, "without a datasheet there is nothing to hold the channels against"
 
 
 class _Returns:

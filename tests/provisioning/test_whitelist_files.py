@@ -521,3 +521,13 @@ def test_a_new_entry_keeps_the_name_that_a_list_gives_it_and_a_known_one_does_no
 def test_a_name_that_xml_cannot_hold_is_still_written_and_read_back() -> None:
     text = "".join(render([WhitelistEntry(ONE, None, "2026-11-28T01:02:03Z", "uuid", "a\x01b\nc")], "xml"))
     assert 'name="a\ufffdb\ufffdc"/>' in text
+
+
+def test_elements_are_nested_sixteen_deep_and_no_deeper(tmp_path: Path) -> None:
+    for deep in (15, 16):
+        text = f"{'<a>' * deep}\n<uuid>{ONE.hex()}</uuid>{'</a>' * deep}"
+        if deep == 15:
+            assert pairs(read(tmp_path, text)) == [(ONE, None)]
+        else:
+            with pytest.raises(BadDataError, match=r"list\.txt:2: elements are nested too deeply\.$"):
+                read(tmp_path, text)

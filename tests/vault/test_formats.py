@@ -183,6 +183,7 @@ def test_a_salt_has_8_to_64_octets(octets: int) -> None:
     ("passphrase", "why"),
     [
         ("1234567", "too short: at least 8 characters"),
+        ("äöüäöüä", "too short: at least 8 characters"),  # of 14 octets
         ("12345678", None),
         ("aaaaaaaaaaaa", "repeats one character"),
         ("aaaaaaab", None),

@@ -25,6 +25,7 @@ from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.selection import create_vault, forget_vaults, open_vault, plan_vault
 
 STORE = "5e" * 16
+CHAINER = "keyring.backends.chainer.ChainerBackend"
 GOOD = "four random words here"
 NOT_ALLOWED = [
     "keyring.backends.null.Keyring",
@@ -551,3 +552,69 @@ def test_a_service_that_dies_is_a_failure_with_a_cure(session: Session) -> None:
     """)
     assert results["error"] in ("VaultError", "KeyringUnavailableError")
     assert results["hint"]
+
+
+class WorksHere:
+    """A backend that works on this machine, though others are better."""
+
+    priority = 0.5
+
+
+class UselessHere:
+    """A backend that may be asked, and does not work on this machine."""
+
+    priority = 0
+
+
+class _FailsToSay(type):
+    @property
+    def priority(cls) -> float:
+        raise RuntimeError("no bus")
+
+
+class FailsHere(metaclass=_FailsToSay):
+    """A backend that fails when it is asked whether it works."""
+
+
+def test_keyrings_that_do_not_work_here_are_passed_over_and_the_others_come_in_their_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    works, useless, fails = (f"{kind.__module__}.{kind.__qualname__}" for kind in (WorksHere, UselessHere, FailsHere))
+    first, absent = works.replace("WorksHere", "BestHere"), works.replace("WorksHere", "NoneHere")
+    monkeypatch.setattr(sys.modules[__name__], "BestHere", type("BestHere", (), {"priority": 5}), raising=False)
+    names = ["no.such.module.Keyring", absent, fails, useless, first, works]
+    monkeypatch.setattr(keyring_vault, "_candidates", lambda: names)
+    monkeypatch.setitem(keyring_vault.ALLOWED, works, "a keyring of this machine")
+    for configured, found in ((None, [first, works]), (CHAINER, [first, works]), (works, [works])):
+        monkeypatch.setattr(keyring_vault, "_configured", lambda configured=configured: configured)
+        assert [name for name, _backend in keyring_vault._viable()] == found
+    names[4:] = []
+    monkeypatch.setattr(keyring_vault, "_configured", lambda: None)
+    with pytest.raises(KeyringUnavailableError, match="has no keyring"):
+        next(keyring_vault._viable())
+
+
+UNREADABLE = "of an unreadable keyringrc.cfg"
+
+
+@pytest.mark.parametrize(
+    ("named", "content", "configured"),
+    [
+        (None, "", None),
+        (None, "[other]\n", None),
+        (None, "[backend]\ndefault-keyring=\n", None),
+        (None, "[backend]\ndefault-keyring = a%b \n", "a%b"),
+        (None, "default-keyring=a.b\n", UNREADABLE),
+        ("", "[backend]\ndefault-keyring=a.b\n", "a.b"),
+        ("x.y", "[backend]\ndefault-keyring=a.b\n", "x.y"),
+    ],
+)
+def test_the_environment_names_the_keyring_before_the_configuration_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str | None, content: str, configured: str | None
+) -> None:
+    place = tmp_path / ".config" / "python_keyring"
+    place.mkdir(parents=True)
+    (place / "keyringrc.cfg").write_text(content)
+    if named is not None:
+        monkeypatch.setenv("PYTHON_KEYRING_BACKEND", named)
+    assert keyring_vault._configured() == configured

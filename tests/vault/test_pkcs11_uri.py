@@ -109,3 +109,11 @@ def test_what_people_call_a_token_and_which_module_is_meant() -> None:
         assert str(Pkcs11Uri.parse(f"pkcs11:{attributes}?module-path=/m.so")) == name
     with pytest.raises(UsageError, match="Use module-path, not module-name"):
         Pkcs11Uri.parse("pkcs11:token=t?module-name=softhsm&module-path=/m.so")
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [(f"token=t;colour=red{M}", "colour"), (f"token=t{M}&x-vendor=1", "x-vendor")]
+)
+def test_an_attribute_that_is_not_known_is_named(text: str, name: str) -> None:
+    with pytest.raises(UsageError, match=rf"^This tool does not know the PKCS #11 URI attribute {name}\.$"):
+        Pkcs11Uri.parse(f"pkcs11:{text}")

@@ -326,3 +326,18 @@ def another_process() -> Iterator[None]:
     yield
     selection._opened.clear()
     selection._opened.update(before)
+
+
+def test_work_that_meets_a_question_begins_anew_once_it_is_answered() -> None:
+    course: list[object] = []
+
+    def ask(prompt: str, confirm: bool) -> str:
+        course.append((prompt, confirm))
+        return f"{prompt} {len(course)}"
+
+    def work(known: Callable[[str, bool], str]) -> list[str]:
+        course.append("begun")
+        return [known(prompt, confirm) for prompt, confirm in (("PIN", False), ("PIN", True), ("PIN", False))]
+
+    assert selection.asked_first(ask, work) == ["PIN 2", "PIN 4", "PIN 2"]
+    assert course == ["begun", ("PIN", False), "begun", ("PIN", True), "begun"]
