@@ -363,6 +363,22 @@ def test_a_block_within_a_block_changes_nothing() -> None:
         assert again is not None
 
 
+def test_a_block_that_fails_gives_all_cores_back() -> None:
+    found: list[OneCore | None] = []
+
+    def fail() -> None:
+        with one_core(StatedKernel()) as kept:
+            found.append(kept)
+            raise LookupError
+
+    with pytest.raises(LookupError):
+        fail()
+    assert found[0] is not None
+    assert found[0].left
+    with one_core(StatedKernel()) as again:
+        assert again is not None
+
+
 def test_a_thread_that_has_started_its_process_is_moved_with_the_others_again() -> None:
     own = threading.get_native_id()
     run = Run(StatedKernel(started=[1, own]))

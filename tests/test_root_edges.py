@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import platform
@@ -18,7 +19,8 @@ import pytest
 from teds_provision import files, lazy, limits, one_core, optional_rooms, portable
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, UsageError, VaultError
 from teds_provision.files import json_files, make_folder, new_file, write_new
-from teds_provision.one_core import OneCore, _capacity, _keep
+from teds_provision.one_core import LinuxKernel, OneCore, _capacity, _keep
+from teds_provision.sanitize import counted
 
 
 def raises(error: Exception) -> Callable[..., Any]:
@@ -470,3 +472,82 @@ def test_a_socket_that_cannot_be_bound_is_closed(tmp_path: Path, monkeypatch: py
 def test_why_a_file_cannot_be_written(error: OSError, failure: Any, kind: type[Exception], message: str) -> None:
     found = files._cannot_write(Path("/a/b"), error, failure)
     assert (type(found), found.message) == (kind, message)
+
+
+def test_a_folder_of_another_user_is_not_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "is_mine", lambda _status: False)
+    with pytest.raises(PermissionError, match="it is not a folder of this user alone") as refused:
+        files.private_folder(tmp_path / "a")
+    assert (refused.value.errno, refused.value.filename) == (errno.EPERM, str(tmp_path / "a"))
+
+
+def test_the_folder_of_a_long_name_of_a_socket_is_open_for_the_block_alone(tmp_path: Path) -> None:
+    deep = tmp_path / ("x" * 100)
+    deep.mkdir()
+    with files.short_path(deep / "s") as short:
+        descriptor = int(short.split("/")[4])
+        assert os.path.samestat(os.fstat(descriptor), deep.stat())
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(descriptor)
+
+
+@pytest.mark.parametrize("path", [Path("/"), Path()])
+def test_what_has_no_name_is_a_folder(path: Path) -> None:
+    with pytest.raises(IsADirectoryError), files.whole_file(path, replace=True):
+        pass
+
+
+@pytest.mark.parametrize("error", [BlockingIOError(errno.EAGAIN, "busy"), OSError(errno.ENOLCK, "no locks")])
+def test_a_file_is_written_whole_in_a_folder_without_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(files, "lock", raises(error))
+    with files.whole_file(tmp_path / "a", replace=False) as file:
+        file.write(b"whole")
+    assert (tmp_path / "a").read_bytes() == b"whole"
+
+
+def test_a_lock_is_of_the_kind_that_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    import fcntl
+
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr(portable, "_FLOCK", lambda *words: asked.append(words))
+    portable.lock(3)
+    portable.lock(3, shared=True)
+    portable.lock(3, wait=True)
+    portable.lock(4, shared=True, wait=True)
+    assert asked == [
+        (3, fcntl.LOCK_EX | fcntl.LOCK_NB),
+        (3, fcntl.LOCK_SH | fcntl.LOCK_NB),
+        (3, fcntl.LOCK_EX),
+        (4, fcntl.LOCK_SH),
+    ]
+    monkeypatch.setattr(portable, "_FLOCK", None)
+    with pytest.raises(OSError, match="this system has no locks of files") as none:
+        portable.lock(3)
+    assert none.value.errno == errno.ENOLCK
+    assert portable._find_flock() is fcntl.flock
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    assert portable._find_flock() is None
+
+
+def test_a_core_works_for_users_the_system_and_interrupts_and_not_while_it_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Time of guests is in that of users already; the sum of all cores is no core."""
+    text = "cpu  9 9 9 9 9 9 9 9 9 9\ncpu0 100 20 30 4000 500 6 7 8 900 99\ncpu12 0 0 0 7 0 0 0 0 0 0\nintr 1\ncpu3 1\n"
+    asked: list[Any] = []
+    monkeypatch.setattr(one_core, "open", lambda *words, **_: asked.append(words) or io.StringIO(text), raising=False)
+    monkeypatch.setattr(os, "sysconf", {"SC_CLK_TCK": 50}.__getitem__)
+    assert LinuxKernel().busy() == {0: 171 / 50, 12: 0.0}
+    assert asked == [("/proc/stat",)]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32-be"])
+def test_json_in_octets_is_read_in_the_encoding_that_it_shows(encoding: str) -> None:
+    assert limits._parsed('{"a": "ä"}'.encode(encoding)) == {"a": "ä"}
+
+
+def test_a_number_has_its_noun_in_singular_or_plural() -> None:
+    assert [counted(number, "day") for number in (0, 1, 2)] == ["0 days", "1 day", "2 days"]
+    assert [counted(number, "entry", "entries") for number in (0, 1, 2)] == ["0 entries", "1 entry", "2 entries"]

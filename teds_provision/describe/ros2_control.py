@@ -97,7 +97,7 @@ def _limits(node: DescribedNode, joint: Joint) -> tuple[float, float]:
     assert channel is not None
     for value, field, key in ((channel.low, "LowLimit", "low-limit"), (channel.high, "HiLimit", "high-limit")):
         if not math.isfinite(value):
-            raise node.missing(FORM, f"{field} of channel {channel.number}", f"{key} of that [[channel]]")
+            raise node.missing(FORM, f"{field} of channel {channel.number}", f"{key} in [channel.{channel.number}]")
     return channel.low, channel.high
 
 
@@ -110,7 +110,7 @@ def _rate(node: DescribedNode, found: Sequence[Joint]) -> int:
         if channel.number in numbers and math.isfinite(channel.period) and channel.period > 0
     ]
     if not periods:
-        raise node.missing(FORM, "SPeriod of a joint's channel", "sampling-period of that [[channel]]")
+        raise node.missing(FORM, "SPeriod of a joint's channel", f"sampling-period in [channel.{min(numbers)}]")
     return max(1, math.floor(1 / max(periods) + 1e-6))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosedError, InvalidStatus
+from websockets.exceptions import ConnectionClosedError, InvalidHandshake, InvalidStatus
 from websockets.http11 import Response
 
 from teds_provision.client import ApiError, Client, default_home
@@ -393,10 +393,11 @@ class Answered:
 def test_readers_are_lent_by_one_word_and_until_the_end(
     status: int, lines: list[bytes], failure: Exception | None, lent: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    line = Answered(status, lines, failure)
-    monkeypatch.setattr("teds_provision.client._UnixConnection", lambda _path, _timeout: line)
-    with Client(home="home").readers() as had:
+    line, opened = Answered(status, lines, failure), list[tuple[Path, float]]()
+    monkeypatch.setattr("teds_provision.client._UnixConnection", lambda *words: opened.append(words) or line)
+    with Client(home="home", timeout=3.5).readers() as had:
         assert (had, line.closed) == (lent, 0)
+    assert opened == [(Path("home/ncap.sock"), 3.5)]
     assert (line.asked, line.closed) == ([("GET", "/api/v1/lend")], 1)
 
 
@@ -501,3 +502,15 @@ def test_a_change_is_not_sent_on_a_connection_that_the_base_station_has_ended(en
     client.close()
     client.close()
     assert (first.closed, second.closed) == ((1, 1) if ended else (1, 0))
+
+
+@pytest.mark.parametrize("error", [InvalidHandshake("no upgrade"), ConnectionRefusedError(111, "refused")])
+def test_who_gets_no_live_connection_is_as_one_whom_nothing_answers(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def connect(_url: str, **_words: Any) -> None:
+        raise error
+
+    monkeypatch.setattr("websockets.sync.client.connect", connect)
+    with pytest.raises(LinkError, match="The base station is not responding"):
+        next(Client("http://bench:1").live())

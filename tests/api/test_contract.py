@@ -101,5 +101,24 @@ def test_an_operation_is_described_with_all_that_it_takes_and_answers() -> None:
         assert content == {"application/json": {"schema": {"$ref": "#/components/schemas/Error"}}}
 
 
+def test_every_operation_is_described_by_what_it_does_with_its_own_parameters() -> None:
+    paths = document()["paths"]
+    for operation in OPERATIONS:
+        found = paths[operation.path][operation.method.lower()]
+        answer = found["responses"][str(operation.status)]
+        assert (found["summary"], answer["description"]) == (operation.does, operation.does)
+        assert found["operationId"].startswith(operation.method.lower())
+        given = [(one["name"], one["in"], one["schema"]) for one in found["parameters"] if one["in"] != "path"]
+        assert given == [
+            *((name, "query", schema) for name, schema in operation.query.items()),
+            *((name, "header", schema) for name, schema in operation.header.items()),
+        ]
+        schema = answer["content"]["application/json"]["schema"]
+        assert ("anyOf" in schema) is isinstance(operation.answer, tuple), operation.path
+        assert schema == {"type": "object"} or operation.answer is not None, operation.path
+        if operation.tag:
+            assert f"({operation.tag})" in answer["headers"]["ETag"]["description"]
+
+
 if __name__ == "__main__":
     SHAPES.write_text("".join(f"{line}\n" for line in shapes()))

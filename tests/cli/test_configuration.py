@@ -15,9 +15,10 @@ from typing import Any, cast
 import click
 import pytest
 
-from teds_provision.cli.config_file import Defaults, anchored, brokers_of, home_of, problems
+from teds_provision.cli.config_file import Defaults, anchored, brokers_of, home_of, problems, read_config
 from teds_provision.cli.main import _read_config, cli, run
 from teds_provision.cli.station.config import _edited
+from teds_provision.errors import BadDataError
 
 from .shell import call, clean_environment
 
@@ -475,4 +476,18 @@ def test_a_list_is_no_value_of_an_option_that_takes_one(home: Path, value: str, 
         "bad-data",
         f"{home / 'config.toml'}: log.last takes one value, not {count}.",
         "Fix that line.",
+    )
+
+
+def test_of_the_faults_of_a_config_the_first_is_named_and_how_all_settings_are_listed(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    assert read_config(path) is None
+    path.write_text("")
+    assert read_config(path) == {}
+    path.write_text("via = 'nfc'\nqqqq = 1\nzzzz = 2\n")
+    with pytest.raises(BadDataError) as refused:
+        read_config(path)
+    assert (refused.value.message, refused.value.hint) == (
+        f"{path}, line 2: no command has an option --qqqq.",
+        "To list all settings: teds-provision config show",
     )

@@ -332,3 +332,33 @@ def test_a_station_that_a_command_opens_warns_notes_and_is_closed_with_it(
     assert (station.use_agent, closed) == (True, [])
     app.close()
     assert closed == ["station"]
+
+
+@pytest.mark.usefixtures("terminal")
+def test_the_results_of_a_certificate_are_listed_and_one_of_them_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course: list[Any] = []
+
+    def prompt(question: str, **how: Any) -> str:
+        course.append((question, list(how["type"].choices), how["err"]))
+        return "as-left"
+
+    monkeypatch.setattr(click, "prompt", prompt)
+    app = App(home=tmp_path)
+    monkeypatch.setattr(app, "note", course.append)
+    app.live_line = lambda: course.append("removed")
+    choose = app.chooses_item()
+    assert choose is not None
+    assert choose("a.xml has two results", [("as-found", "before"), ("as-left", "after")]) == "as-left"
+    assert course == [
+        "a.xml has two results:", "  as-found: before", "  as-left: after", "removed",
+        ("Which one", ["as-found", "as-left"], True),
+    ]  # fmt: skip
+    assert App(home=tmp_path, no_input=True).chooses_item() is None
+
+
+def test_json_is_indented_if_asked_for_and_steers_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(context.sys, "stdout", io.StringIO())
+    assert to_json({"a": [1]}, indent=1) == '{\n "a": [\n  1\n ]\n}'
+    assert to_json({"a": "\u202eä"}) == '{"a": "\\u202eä"}'

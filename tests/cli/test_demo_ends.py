@@ -334,7 +334,8 @@ def test_a_measurement_of_the_story_that_fails_ends_it_and_its_bus_is_closed(
     monkeypatch.setattr(story.buses_room, "Buses", lambda _ports: nullcontext("buses"))
     monkeypatch.setattr(
         story.measurement, "Measurement",
-        lambda *words: made.append(words) or SimpleNamespace(run=lambda _stop, seconds: ended),
+        lambda *words: made.append(words)
+        or SimpleNamespace(run=lambda stop, seconds: made.append((stop.is_set(), seconds)) or ended),
     )  # fmt: skip
     monkeypatch.setattr(story, "_last_row", lambda file: f"row of {file.name}")
     groups: list[Any] = []
@@ -349,6 +350,9 @@ def test_a_measurement_of_the_story_that_fails_ends_it_and_its_bus_is_closed(
     [step] = demo.steps.done
     assert (step.name, step.detail) == ("measure", "group robot, 2 nodes: 42 values, 3 lost; last row of run.csv")
     assert (closed, groups, made[0][5].group) == (["port"], [("robot", list(uuids))], "robot")
+    _station, _buses, measured, asked, files, _facts = made[0]
+    assert (measured, asked.rate, asked.timeout, files) == (uuids, 100.0, 15.0, [str(tmp_path / "run.csv")])
+    assert made[1] == (False, 1.0)
 
 
 def test_the_newest_value_of_each_column_with_a_unit_is_shown(tmp_path: Path) -> None:
@@ -418,3 +422,41 @@ def test_the_folder_of_a_demo_has_its_mode_and_is_gone_however_it_ends(mode: int
     with pytest.raises(LinkError):
         fail()
     assert (closed, folders[0].exists()) == (["True"], False)
+
+
+@pytest.mark.parametrize(("pause", "waited", "safe"), [(0.2, 0.2, True), (9.0, 0.5, True), (0.2, 0.2, False)])
+def test_the_gripper_of_the_story_is_operated_twice_and_is_safe_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pause: float, waited: float, safe: bool
+) -> None:
+    course: list[Any] = []
+
+    class Hand:
+        """A mock of a held actuator; whether it is safe is known once it was let go."""
+
+        safe = False
+
+        def __init__(self, *words: Any, unit: str) -> None:
+            course.append((*words, unit))
+            self.pause = pause
+
+        def __enter__(self) -> Hand:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            course.append("let go")
+            self.safe = safe
+
+        def apply(self, value: float) -> Any:
+            course.append(value)
+            return SimpleNamespace(value=40.12345, unit="mm")
+
+    monkeypatch.setattr(story, "meet", lambda _station, via, uuid, _reporter: nullcontext((via, uuid)))
+    monkeypatch.setattr(story.verified_session, "open_trusted", lambda _station, node, by: (*node, by))
+    monkeypatch.setattr(story.held_actuator, "HeldActuator", Hand)
+    monkeypatch.setattr(story, "time", SimpleNamespace(sleep=lambda seconds: course.append(("wait", seconds))))
+    demo = demo_in(tmp_path)
+    with nullcontext() if safe else pytest.raises(LinkError, match="is not in its safe state"):
+        story.move_gripper(demo, None, bytes(10))  # type: ignore[arg-type]
+    assert course == [(("can", bytes(10), "demo"), 1, "mm"), 40.0, ("wait", waited), 40.0, "let go"]
+    details = [step.detail for step in demo.steps.done]
+    assert details == (["hand: opening 40.12 mm, then back to its safe state"] if safe else [])

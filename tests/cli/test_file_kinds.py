@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,12 @@ LONG = " " * 70
         (b'{"whitelist": []}', "a whitelist"),
         (f'{{{LONG}"whitelist": []}}'.encode(), None),
         (b'{"format": "nothing/1"}', None),
+        (b'{"recipients": [], "format" : "teds-backup/2"}', "a backup of a station"),
+        (b'{"format":"teds-station-request/1"}', "a station's certificate request"),
+        (b'{"format": "teds-station-certificate/1"}', "a station's certificate"),
+        (b'{"event": "x", "format": "teds-trace/1"}', "a trace"),
+        (b'{"format": "teds/1"}', "TEDS in JSON"),
+        (b'{"a": "' + b" " * 4096 + b'", "format": "teds/1"}', None),
         (b'{"a": 1}', None),
         (b"# teds-provision measurement\n", "a recording (text)"),
         (b'VERSION "1"', "a DBC file"),
@@ -111,6 +118,8 @@ LONG = " " * 70
         (b"[fileinfo]\n", "an EDS file"),
         (b"; x\n[DeviceInfo]\n", "an EDS file"),
         (b"title = 'x'\nextends = 'y'\n", "a transducer profile (TOML)"),
+        (b"extends='y'\n", "a transducer profile (TOML)"),
+        ("raw,value [°C]\n".encode("latin-1"), "a calibration (CSV)"),
         (b"[channel.1]\n", "a transducer profile (TOML)"),
         (b"# date\n\nRaw; value [degree]\n", "a calibration (CSV)"),
         (b"raw,other\n", None),
@@ -188,3 +197,9 @@ def test_a_mark_before_the_text_hides_no_kind(tmp_path: Path, mark: str) -> None
     file = tmp_path / "file"
     file.write_text(f"{mark}<whitelist/>", encoding="utf-8")
     assert _kind_of(file) == "a whitelist"
+
+
+def test_a_pipe_has_no_kind_and_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("it was opened"))
+    assert _kind_of(tmp_path / "pipe") is None

@@ -10,8 +10,10 @@ from pathlib import Path
 import click
 import pytest
 
+from teds_provision.cli import extending
 from teds_provision.cli.main import cli
 from teds_provision.cli.table import COMMANDS, GROUPS
+from teds_provision.optional_rooms import OptionalRoom
 
 from .shell import clean_environment, python, spawn
 
@@ -163,3 +165,25 @@ def test_every_output_file_is_named_by_o_too() -> None:
         if "--output" in option.opts and "-o" not in option.opts
     }
     assert without == set()
+
+
+def test_examples_of_a_room_stand_behind_the_last_one_of_the_core() -> None:
+    command = click.Command("x", epilog="Examples:\n  x a\n  x b\n  y a\nEnd.")
+    extending.add_examples(command, " a", "x c", "x d")
+    assert command.epilog == "Examples:\n  x a\n  x b\n  y a\n  x c\n  x d\nEnd."
+
+
+def test_every_room_extends_a_command_that_it_names_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[tuple[str, str, click.Command]] = []
+    present = {
+        "one": OptionalRoom(extends={"nodes": "a:f", "log": "a:g"}),
+        "two": OptionalRoom(),
+        "three": OptionalRoom(extends={"nodes": "b:h"}),
+    }
+    monkeypatch.setattr(extending, "rooms", lambda: present)
+    monkeypatch.setattr(extending, "load", lambda room, place: lambda command: course.append((room, place, command)))
+    monkeypatch.setattr(extending, "_EXTENDED", set())
+    nodes, other = click.Command("nodes"), click.Command("groups")
+    for command in (nodes, other, nodes):
+        extending.extend(str(command.name), command)
+    assert course == [("one", "a:f", nodes), ("three", "b:h", nodes)]

@@ -159,6 +159,8 @@ def test_the_cure_for_a_missing_package_fits_where_the_program_is(
     assert how_to_install("plot") == f"Install it: {sys.executable} -m pip install 'teds-provision[plot]'"
     monkeypatch.setattr(sys, "prefix", "/home/anna/.local/share/pipx/venvs/teds-provision")
     assert how_to_install("label") == "Install it: pipx runpip teds-provision install 'teds-provision[label]'"
+    monkeypatch.setattr(sys, "prefix", "/srv/pipx/own")
+    assert lazy.install_command("nfcpy>=1.0", "pint") == f"{sys.executable} -m pip install 'nfcpy>=1.0' pint"
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(lazy, "util", SimpleNamespace(find_spec=lambda _name: None))
     assert how_to_install("ble") == f"Install it: uv pip install --python {sys.executable} 'teds-provision[ble]'"

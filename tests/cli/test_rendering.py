@@ -241,6 +241,7 @@ def test_a_value_that_an_option_takes(kind: click.ParamType, value: Any, found: 
         (WholeNumber(1, 12), "13", "13 is not in the range"),
         (ChannelName(), "0", "0 is not in the range"), (ChannelName(), "256", "256 is not in the range"),
         (ChannelName(), "1.5", "'1.5' is not a channel number, 1 to 255, or a channel's name."),
+        (ChannelName(0), "1.5", "'1.5' is not a channel number, 0 to 255, or a channel's name."),
         (ChannelName(), "", "'' is not a channel number"), (ChannelName(), "a\x1bb", "is not a channel number"),
         (Seconds(min=0.1), "soon", "'soon' is not a number of seconds, e.g. 30 or 2.5."),
         (Seconds(min=0.1), "0.05", "0.05 is not in the range"),
@@ -337,3 +338,30 @@ def test_a_wait_that_is_over_has_no_seconds_left(monkeypatch: pytest.MonkeyPatch
     assert str(live._render().text) == "agree  Tap it (1 s left)"
     now[0] = 103.0
     assert str(live._render().text) == "agree  Tap it (0 s left)"
+
+
+@pytest.mark.parametrize("encoding", [None, "UTF8"])
+def test_a_list_that_is_empty_or_fails_at_once_is_one_object_and_is_printed_before_the_end(
+    monkeypatch: pytest.MonkeyPatch, encoding: str | None
+) -> None:
+    flushed: list[str] = []
+
+    class Output(io.StringIO):
+        def flush(self) -> None:
+            flushed.append(self.getvalue())
+
+    def entries() -> Iterator[dict[str, Any]]:
+        raise PolicyError("Höher geht es nicht.")
+        yield {}
+
+    monkeypatch.setattr(Output, "encoding", encoding, raising=False)
+    monkeypatch.setattr(sys, "stdout", Output())
+    print_json_list("list", [])
+    assert flushed == ['{"list": []}\n']
+    monkeypatch.setattr(sys, "stdout", Output())
+    with pytest.raises(click.exceptions.Exit):
+        print_json_list("list", entries())
+    [_, text] = flushed
+    assert text.startswith('{"list": [], "error": {')
+    assert '"Höher geht es nicht."' in text
+    assert text.endswith("}}\n")

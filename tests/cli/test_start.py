@@ -300,3 +300,18 @@ def test_on_the_first_screen_is_what_waits_for_a_person_and_nothing_that_is_good
 def test_a_link_that_is_down_comes_before_one_that_is_silent() -> None:
     links = [link("can:silent"), link("can:down", state="down")]
     assert start._next({"links": links, "nodes": []}) == "teds-provision doctor --can down"
+
+
+def test_of_several_nodes_the_first_that_needs_work_comes_next() -> None:
+    bus = "can:udp_multicast:239.74.1.1?port=5"
+    new = {**ARM, "uuid": "8e", "name": None, "state": "factory"}
+    for nodes, following in (
+        ([ARM, new], "provision --profile PROFILE --can x"),
+        ([{**new, "whitelisted": False}, {**ARM, "verdict": None}], "identify --add --can x"),
+        ([ARM, {**ARM, "name": "my arm", "verdict": None}], "verify 'my arm' --can x"),
+        ([{**ARM, "link": bus, "verdict": None}], "verify arm --can 'udp_multicast:239.74.1.1?port=5'"),
+        ([{**ARM, "name": None}, {**ARM, "name": "leg"}], "measure 8d"),
+    ):
+        assert start._next({"links": [link("can:x", nodes=2)], "nodes": nodes}) == f"teds-provision {following}"
+    down = [link("ble:hci0?address=C1", state="down"), link("can:x", state="down")]
+    assert start._next({"links": down, "nodes": []}) == "teds-provision doctor --ble 'hci0?address=C1'"

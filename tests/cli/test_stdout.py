@@ -246,3 +246,20 @@ def test_a_result_that_stdout_does_not_take_is_an_error_for_a_program_and_a_note
                 give()  # what is still buffered then goes nowhere, so that the end of the block does not fail
     note = "Cannot write the result to stdout: No space left on device.\n"
     assert capsys.readouterr().err == ("" if as_json else note * 2)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_guarded_output_goes_on_where_the_plain_one_ended(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
+    """A name that the encoding lacks is no error after the work is done; a person sees each line at once."""
+    octets = io.BytesIO()
+    plain = io.TextIOWrapper(octets, encoding="ascii")
+    plain.write("early")
+    monkeypatch.setattr(sys, "stdout", plain)
+    monkeypatch.setattr(stdout.GuardedOutput, "isatty", lambda _: terminal)
+    output = stdout.guard()
+    guarded: Any = sys.stdout
+    assert output is not None
+    assert (octets.getvalue(), output.fileno(), type(guarded)) == (b"early", 1, CleanText)
+    assert (guarded.encoding, guarded.errors, guarded.line_buffering) == ("ascii", "backslashreplace", terminal)
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    assert stdout.guard() is None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jsonschema
 import pytest
@@ -258,3 +260,39 @@ def test_a_sensor_alone_has_no_joint(station: Station, board: Board, tmp_path: P
 
     with pytest.raises(BadDataError, match="no joint"):
         ros2_control.joints(replace(node, sheet=replace(node.sheet, channels=sensors)), Topics(station_facts(station)))
+
+
+@pytest.mark.parametrize(
+    ("record", "name", "profile"),
+    [
+        (None, "own", ""),
+        (SimpleNamespace(name="", profile=None), "own", ""),
+        (SimpleNamespace(name="left", profile="gripper"), "left", "gripper"),
+    ],
+)
+@pytest.mark.parametrize("security", [b"sealed", None])
+def test_what_is_described_is_the_last_reading_as_it_is_shown_here(
+    monkeypatch: pytest.MonkeyPatch, record: Any, name: str, profile: str, security: bytes | None
+) -> None:
+    required: list[Any] = []
+    image: Any = SimpleNamespace(security=security)
+    shown = SimpleNamespace(meta=SimpleNamespace(name="own"))
+    sheet = SimpleNamespace(shown_in=lambda units: shown if units == "mm" else None)
+    station: Any = SimpleNamespace(
+        datasheets=SimpleNamespace(datasheet=lambda _uuid: image), nodes=SimpleNamespace(get=lambda _uuid: record)
+    )
+    verdict: Any = SimpleNamespace(verified="today")
+    monkeypatch.setattr(of_node, "verdict_of", lambda _station, _uuid: verdict)
+    monkeypatch.setattr(of_node, "require_authentic", required.append)
+    monkeypatch.setattr(of_node, "shown_units", lambda _station, _uuid: "mm")
+    monkeypatch.setattr(of_node, "Sheet", SimpleNamespace(from_image=lambda _image: sheet))
+    monkeypatch.setattr(of_node, "nameplate_of", lambda _image: {"serialno": "1"})
+    found = described_node(station, bytes(10))
+    digest = hashlib.sha256(security or b"").hexdigest()
+    assert found == DescribedNode(bytes(10), name, profile, shown, {"serialno": "1"}, digest)  # type: ignore[arg-type]
+    assert required == ["today"]
+    verdict = None
+    with pytest.raises(NotFoundError) as refused:
+        described_node(station, bytes(10))
+    assert refused.value.message == f"No datasheet of node {bytes(10).hex()} is known here."
+    assert refused.value.hint == f"Read it first: verify {bytes(10).hex()}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,6 +15,7 @@ import pytest
 from teds_provision.describe import ros2_control
 from teds_provision.describe.described_node import DescribedNode, MissingFieldError
 from teds_provision.describe.thing_description import thing_description
+from teds_provision.errors import BadDataError
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.names import Topics
 from teds_provision.teds.calibration import Calibration, CalibrationInput
@@ -251,10 +253,10 @@ def test_the_rate_is_whole_hertz_of_the_slowest_channel_of_a_joint_and_never_0(
 @pytest.mark.parametrize(
     ("change", "message", "key"),
     [
-        ({"low": math.nan}, "LowLimit of channel 1", "low-limit of that [[channel]]"),
-        ({"high": math.inf}, "HiLimit of channel 1", "high-limit of that [[channel]]"),
-        ({"timing": Timing(period=0.0)}, "SPeriod of a joint's channel", "sampling-period of that [[channel]]"),
-        ({"timing": Timing()}, "SPeriod of a joint's channel", "sampling-period of that [[channel]]"),
+        ({"low": math.nan}, "LowLimit of channel 1", "low-limit in [channel.1]"),
+        ({"high": math.inf}, "HiLimit of channel 1", "high-limit in [channel.1]"),
+        ({"timing": Timing(period=0.0)}, "SPeriod of a joint's channel", "sampling-period in [channel.1]"),
+        ({"timing": Timing()}, "SPeriod of a joint's channel", "sampling-period in [channel.1]"),
     ],
 )
 def test_a_joint_without_a_limit_or_a_period_is_refused_by_name(change: dict[str, Any], message: str, key: str) -> None:
@@ -391,3 +393,34 @@ TechnicalData/TechnicalProperties/Channel4/Kind = string event sensor <>
 TechnicalData/TechnicalProperties/Channel4/Name = string lamp <>
 TechnicalData/TechnicalProperties/Channel4/SamplingPeriod = double 9.0 <>
 TechnicalData/TechnicalProperties/Channel4/Unit = string count <>""".splitlines()
+
+
+def test_each_joint_of_a_node_has_its_interfaces_and_a_node_without_one_is_refused() -> None:
+    topics = Topics(StationFacts("bench"))
+    wrist = replace(CHANNELS[0], number=5, name="wrist", units=units_of(radians=1), low=-1 / 3)
+    wheel = replace(CHANNELS[0], number=6, name="wheel", units=units_of(radians=1, seconds=-1))
+    node = with_channels(*CHANNELS, wrist, wheel)
+    text = ros2_control.xacro(node, ros2_control.joints(node, topics), topics)
+    assert re.findall('<joint name="(.*?)">', text) == ["hand_opening", "hand_wheel", "hand_wrist"]
+    assert re.findall('<command_interface name="(.*?)">', text) == ["position", "velocity", "position"]
+    assert f'<param name="min">{-1 / 3!r}</param>' in text, "every digit"
+    without = with_channels(*(replace(channel, timing=Timing()) for channel in (*CHANNELS, wrist, wheel)))
+    with pytest.raises(MissingFieldError) as lacking:
+        ros2_control.controllers(without, ros2_control.joints(without, topics), topics)
+    assert "Add sampling-period in [channel.1] to its profile" in lacking.value.hint
+    with pytest.raises(BadDataError) as refused:
+        ros2_control.joints(with_channels(CHANNELS[2]), topics)
+    assert (refused.value.message, refused.value.hint) == (
+        f"Node {UUID.hex()} has no joint.",
+        "A joint is an actuator of an angle, a length, their speeds, a force or a torque.",
+    )
+
+
+def test_a_shell_is_readable_text_and_has_channels_of_an_unknown_kind() -> None:
+    pytest.importorskip("basyx")
+    from teds_provision.describe.asset_shell import asset_shell
+
+    text = asset_shell(with_channels(replace(CHANNELS[0], kind=None, name="Öffnung")))
+    assert "TechnicalData/TechnicalProperties/Channel1/Kind = string unknown <>" in lines(json.loads(text)["submodels"])
+    assert "Öffnung" in text
+    assert text.endswith("\n}\n")

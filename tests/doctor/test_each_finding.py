@@ -11,14 +11,14 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from teds_provision.doctor import fleet, links, machine, station
+from teds_provision.doctor import checks, fleet, links, machine, station
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code, intact
 from teds_provision.errors import (
     KeyringUnavailableError,
@@ -31,6 +31,7 @@ from teds_provision.errors import (
     WrongPassphraseError,
 )
 from teds_provision.links.nfc import pcsc_readers
+from teds_provision.station.node_keys import deferred
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import StationRecord
 from teds_provision.station.store.row_sample import RowSample
@@ -883,3 +884,147 @@ def test_a_file_of_keys_that_cannot_be_read_is_passed_over(
 
     monkeypatch.setattr(station, "open_to_read", refuse)
     assert station.holds_private_key(tmp_path / "a.pem") is False
+
+
+def test_a_check_that_breaks_is_named_with_its_error(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_system: System) -> Iterator[Finding]:
+        raise ValueError("odd")
+        yield
+
+    def refused(_system: System) -> Iterator[Finding]:
+        yield Finding("b", "ok", "First.")
+        raise LinkError("It is lost.", hint="Plug it in.")
+
+    monkeypatch.setattr(checks, "CHECKS", {"a": ("machine", broken), "b": ("link", refused)})
+    monkeypatch.setattr(checks, "_MODULES", ())
+    monkeypatch.setattr(checks, "_OF_ROOMS", SimpleNamespace(parts=list))
+    assert list(examine(system)) == [
+        ("machine", Finding("a", "failed", "the check itself failed: ValueError: odd.", "Report this.")),
+        ("link", Finding("b", "ok", "First.")),
+        ("link", Finding("b", "failed", "It is lost.", "Plug it in.")),
+    ]
+
+
+@pytest.mark.parametrize(("sampled", "among"), [(False, ""), (True, " (of the 5,000 keyed last)")])
+def test_what_waits_for_a_person_has_its_remedy(
+    stationed: System, monkeypatch: pytest.MonkeyPatch, sampled: bool, among: str
+) -> None:
+    one, two = bytes(10), bytes([1]) * 10
+    tally = SimpleNamespace(overdue=[one], twice=[one, two], drafts=[two], unverified=[one], rotations=[one, two])
+    later = deferred(datetime(2099, 1, 1, tzinfo=UTC), "station lost was removed")
+
+    def waiting(day: str, sample: RowSample) -> Any:
+        assert datetime.fromisoformat(day).strftime("%Y-%m-%d") == day
+        sample.sampled = sampled
+        return tally
+
+    @contextmanager
+    def inspect(_home: Path) -> Iterator[Any]:
+        yield SimpleNamespace(
+            overview=SimpleNamespace(waiting=waiting),
+            keys=SimpleNamespace(rotations_due=lambda: {one: "restored", two: later}),
+        )
+
+    monkeypatch.setattr(Station, "inspect", inspect)
+    monkeypatch.setattr(fleet, "_firmware", lambda _station, _sample: ([], [two]))
+    first, second = one.hex(), two.hex()
+    expected = [
+        ("warning", f"1 with an expired calibration: {first}.", "teds-provision nodes --due 0"),
+        ("warning", f"2 with a name that another node has{among}: {first}, {second}.",
+         "Give them different names: build UUID --name, sign, write"),
+        ("warning", f"1 with a datasheet that was built but not written: {second}.", "teds-provision draft list"),
+        ("warning", f"1 keyed but never verified{among}: {first}.", "teds-provision verify UUID"),
+        ("warning", f"1 whose firmware changed since calibration: {second}.",
+         "Calibrate again, or: verify UUID --accept-firmware"),
+        ("warning", f"1 whose key must be rotated: {first}.", "Open a session once: teds-provision verify UUID"),
+        ("warning", f"1 whose key another holder rotates first: {second}.",
+         "Wait for its copy; verify UUID does it from 2099-01-01T00:00:00Z on"),
+    ]  # fmt: skip
+    part = "names, verdicts and firmware were looked at of the 5,000 nodes keyed last and of some others"
+    found = words(stationed, "nodes")
+    assert found[:7] == expected
+    assert found[7:] == ([("ok", f"N{part[1:]} (doctor --full checks all).", "")] if sampled else [])
+
+
+def test_every_reader_that_is_plugged_in_is_looked_at(system: System) -> None:
+    first, second, *_ = links.READERS
+    devices = system.at("/sys/bus/usb/devices")
+    for name, (vendor, product) in (("1-3", second), ("1-2", first), ("1-1", (0x1D6B, 2))):
+        (devices / name).mkdir(parents=True)
+        (devices / name / "idVendor").write_text(f"{vendor:04x}\n")
+        (devices / name / "idProduct").write_text(f"{product:04x}\n")
+    names = [f"reader usb:{vendor:04x}:{product:04x}" for vendor, product in (first, second)]
+    assert [(found.name, found.fix) for found in links.readers(system)] == [
+        (name, "Run doctor again.") for name in names
+    ]
+    assert one(links.readers(replace(system, root=system.root / "none"))) == Finding(
+        "nfc readers", "skipped", f"None of the {len(links.READERS)} USB readers that nfcpy supports is plugged in."
+    )
+
+
+@pytest.mark.parametrize(
+    ("version", "result"), [((3, 10, 9), "failed"), ((3, 11, 0), "ok"), ((3, 12, 1), "ok"), ((4, 0, 0), "ok")]
+)
+def test_python_is_new_enough_from_3_11_on(
+    system: System, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...], result: Any
+) -> None:
+    shown = ".".join(map(str, version))
+    monkeypatch.setattr(machine, "sys", SimpleNamespace(version_info=version))
+    monkeypatch.setattr(machine, "platform", SimpleNamespace(python_version=lambda: shown, platform=lambda: "Linux-6"))
+    fix = "" if result == "ok" else "Install Python 3.11 or newer and recreate the virtual environment."
+    assert one(machine.python(system)) == Finding("python", result, f"Python {shown} on Linux-6.", fix)
+
+
+def test_home_and_disk_word_for_word(stationed: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = stationed.home
+    assert words(replace(stationed, home=tmp_path / "none"), "home") == [
+        ("skipped", f"There is no station in {tmp_path / 'none'} yet.", "teds-provision init")
+    ]
+    home.chmod(0o700)
+    for name in ("vault.json", "store.sqlite3"):
+        (home / name).chmod(0o604)
+    assert words(stationed, "home") == [
+        ("ok", f"{home} is private to this user.", ""),
+        ("failed", "Other users can read store.sqlite3, vault.json.",
+         f"chmod 600 {home / 'store.sqlite3'} {home / 'vault.json'}"),
+    ]  # fmt: skip
+    home.chmod(0o755)
+    assert words(stationed, "home")[0] == ("warning", f"Other users can read {home}.", f"chmod 700 {home}")
+    home.chmod(0o777)
+    assert words(stationed, "home")[0] == ("failed", f"Other users can write to {home}.", f"chmod 700 {home}")
+    monkeypatch.setattr(os, "geteuid", lambda: home.stat().st_uid + 1)
+    assert words(stationed, "home")[0][2] == f"sudo chown -R $USER {home}, or use another --home"
+    for free, found in (
+        ((65 << 20) - 1, ("ok", f"64 MiB free at {home}.", "")),
+        ((64 << 20) - 1, ("warning", f"63 MiB free at {home}.",
+                          "Free some space: a full disk stops every command that changes something.")),
+    ):  # fmt: skip
+        monkeypatch.setattr(station.shutil, "disk_usage", lambda _path, free=free: SimpleNamespace(free=free))
+        assert words(stationed, "disk") == [found]
+
+
+def test_a_vault_in_the_keyring_is_named_as_the_keyring_names_it(
+    stationed: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Station.inspect(stationed.home) as store:
+        store.identity.put(StationRecord("bench", "keyring"))
+        own = store.id
+    opened = SimpleNamespace(open=lambda store_id: SimpleNamespace(description=f"KWallet, {store_id}"))
+    monkeypatch.setattr(station, "KeyringVault", opened)
+    assert words(stationed, "vault") == [("ok", f"KWallet, {own}.", "")]
+
+
+@pytest.mark.parametrize(
+    ("octets", "holds"),
+    [
+        (b"PuTTY-User-Key-File-3: ssh-ed25519\n", True),
+        (b"\x30" + bytes(43) + b"\x02\x01\x00\x30", True),
+        (b"\x30" + bytes(44) + b"\x02\x01\x00\x30", False),  # of a larger structure
+        (b'{"kty": "EC", "k": "AA"}', True),
+        (b'{"kty": "EC", "d" : "AA"}', True),
+        (b"", False),
+    ],
+)
+def test_which_octets_are_a_private_key(tmp_path: Path, octets: bytes, holds: bool) -> None:
+    (tmp_path / "a").write_bytes(octets)
+    assert station.holds_private_key(tmp_path / "a") is holds
