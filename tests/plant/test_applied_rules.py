@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from teds_provision.handover import deny
+from teds_provision.plant import apply_pages
 from teds_provision.plant.apply_pages import apply_claims, merged_views, put_roster, take_pages, take_rosters
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
@@ -305,6 +306,16 @@ def test_a_ban_counts_of_who_holds_or_was_given_the_nodes_key_by_the_own_store(d
 def test_a_statement_bans_the_node_that_it_names_not_the_one_of_its_event(desk: Desk) -> None:
     desk.say(desk.keep, desk.ban(desk.keep, A, about=B))
     assert (desk.denied(A), desk.denied(B)) == (False, False)
+
+
+def test_of_many_nodes_a_few_are_judged_at_once_until_all_are(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    desk.next(desk.all)
+    monkeypatch.setattr(apply_pages, "AT_ONCE", 2)
+    for one in (desk.keep, desk.keep2):
+        one.page(*(one.event("pinned", uuid, fingerprint=PIN, assurance="tap") for uuid in NODES))
+        take_pages(desk.station, desk.roster, [open_page(one.pages[-1], REGISTRY, desk.roster.point_of)])
+    assert (apply_claims(desk.station), apply_claims(desk.station)) == (3, 0)
+    assert [desk.listed(uuid) for uuid in NODES] == [(PIN, "registry")] * 3
 
 
 @pytest.mark.parametrize(("who", "ends"), [("base", False), ("line", True), ("keep", True)])

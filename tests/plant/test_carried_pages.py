@@ -70,6 +70,22 @@ def test_a_chain_waits_for_a_newer_version_until_it_is_read_on(plants: Plant) ->
         assert plants.north.plant.pages.chain(west.fingerprint).waits == waits
 
 
+def test_the_page_of_a_newer_version_is_the_one_after_the_newest_that_is_here(plants: Plant) -> None:
+    west = plants.member("west", "base")
+    pages_of(plants, west)
+    plants.round()
+    pages = plants.north.plant.pages
+    newest = max(n for n, _, _ in pages.chain_links(pages.chain(west.fingerprint).id))
+    assert newest >= 3
+    for author in (west.fingerprint, "ab" * 32):
+        note_waiting(plants.north, author, Taken(waits="A page of format 9."))
+    found = {alarm.about: (alarm.code, alarm.n, alarm.why) for alarm in plants.north.plant.alarms.all()}
+    assert found == {
+        west.fingerprint: ("newer-format", newest + 1, "A page of format 9."),
+        "ab" * 32: ("newer-format", 1, "A page of format 9."),
+    }
+
+
 def test_a_job_of_another_registry_is_refused_though_a_keeper_signed_it(tmp_path: Path) -> None:
     keeper = alone(tmp_path / "home")
     assert read_job(keeper, job_of(keeper)).title == "three angles"

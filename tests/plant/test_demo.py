@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -119,6 +120,35 @@ def test_a_server_that_does_not_start_is_reported_with_the_end_of_its_log(
         cluster.Cluster(tmp_path, 54321, Path("/bin")).start()
     assert error.value.message == f"PostgreSQL did not start: {'y' * 500}"
     assert asked == [["/bin/pg_isready", "-q", "-h", str(tmp_path / "s"), "-p", "54321"]] * looks
+
+
+@pytest.mark.parametrize("setpriv", [True, False])
+def test_the_server_ends_with_the_demo_and_neither_by_ctrl_c_nor_in_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, setpriv: bool
+) -> None:
+    started, answers = list[Any](), iter([2, 0])
+
+    def popen(words: list[str], *, stdout: Any, stderr: Any, **how: Any) -> Any:
+        assert stdout is stderr
+        stdout.write(b"started\n")
+        started.append((words, how))
+        return SimpleNamespace(poll=lambda: None)
+
+    monkeypatch.setattr(cluster.shutil, "which", lambda name: f"/bin/{name}" if setpriv and name == "setpriv" else None)
+    monkeypatch.setattr(cluster, "time", SimpleNamespace(monotonic=lambda: 0.0, sleep=lambda _: None))
+    monkeypatch.setattr(cluster.subprocess, "Popen", popen)
+    monkeypatch.setattr(cluster.subprocess, "run", lambda words, check: SimpleNamespace(returncode=next(answers)))
+    monkeypatch.setattr(cluster, "runs_as", lambda: "me")
+    monkeypatch.setattr(cluster.os, "geteuid", lambda: 0 if setpriv else 1000)
+    (tmp_path / "log").write_bytes(b"made\n")
+    cluster.Cluster(tmp_path, 54321, Path("/bin")).start()
+    before = ["setpriv", "--pdeathsig", "INT", "--"] if setpriv else []
+    [(words, how)] = started
+    assert words == [*before, "/bin/postgres", "-D", str(tmp_path / "data")]
+    assert how == {
+        "stdin": subprocess.DEVNULL, "cwd": "/", "start_new_session": True, "user": "me" if setpriv else None
+    }  # fmt: skip
+    assert (tmp_path / "log").read_bytes() == b"made\nstarted\n"
 
 
 @pytest.mark.parametrize("fails", [True, False])

@@ -101,6 +101,15 @@ def test_a_page_that_is_there_with_another_content_is_never_replaced(transport: 
     assert (stick / "roster" / "2.jws").read_bytes() == b"roster"
 
 
+def test_a_page_that_another_program_wrote_with_blanks_around_it_is_the_same_page(
+    transport: FolderTransport, stick: Path
+) -> None:
+    octets = b"h.Zmlyc3Q.s"
+    put(stick / WEST / "3.jws", b"\r\n" + octets + b"\r\n")
+    transport.append(WEST, 3, "", hash_of(octets), octets)
+    assert names(stick / WEST) == ["3.jws"]
+
+
 def test_parcels_lie_below_their_receiver(transport: FolderTransport, stick: Path) -> None:
     for number in range(18):
         transport.send(Parcel(IDS[number], WEST, b"sealed %d" % number, ""))

@@ -14,7 +14,7 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.cli.rendering import local_time as local
-from teds_provision.errors import PolicyError, UsageError
+from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.plant.commands import line as commands
 from teds_provision.plant.commands import provision as of_provision
@@ -126,6 +126,23 @@ def test_a_job_of_a_list_has_each_board_and_its_calibration(home: Path, tmp_path
         boards.write_text(text)
         refused = new(home, *words)
         assert (refused.code, "full fingerprint (64 digits)" in refused.json["error"]["message"]) == (8, True)
+
+
+def test_the_allotment_of_a_station_stands_after_the_last_sign_and_is_of_a_member() -> None:
+    members = {"bench=2": "aa" * 32, "bench": "bb" * 32, "gone": "cc" * 32}
+    roster: Any = SimpleNamespace(
+        named=lambda name: SimpleNamespace(fingerprint=members[name]) if name in members else None,
+        member=lambda fingerprint: "a member" if fingerprint != members["gone"] else None,
+    )
+    assert commands._allotment(roster, "bench=2=5", 9) == ("aa" * 32, 5)
+    assert commands._allotment(roster, "bench=2", 9) == ("bb" * 32, 2)
+    assert commands._allotment(roster, "bench", 9) == ("bb" * 32, 9)
+    for name in ("gone", "nobody"):
+        with pytest.raises(NotFoundError) as error:
+            commands._allotment(roster, f"{name}=3", 9)
+        assert (error.value.message, error.value.hint) == (
+            f"The roster has no member {name!r}.", "See: teds-provision registry status"
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize(

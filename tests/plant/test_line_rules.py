@@ -16,7 +16,7 @@ import pytest
 from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, RosterExpiredError
 from teds_provision.plant import jobs
 from teds_provision.plant.jobs import close_job, job_id, read_job, require_open, take_job
-from teds_provision.plant.line import LineRun, LineUnit, Scans, _firmware_in_session
+from teds_provision.plant.line import LineRun, LineUnit, Scans, _firmware_in_session, _step_facts
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.plant.evidence import BoardFacts, EvidenceClaim
@@ -26,6 +26,7 @@ from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import PreparedOrder
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.provisioning.progress import StepResult
 from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.plant.line import EvidenceRow, UnitRow
 from teds_provision.station.station import Station
@@ -519,6 +520,14 @@ def test_a_scan_is_of_the_last_label_with_its_key() -> None:
         scans.add_label(malformed)
         assert notices[-1] == f"This is not a board label: {malformed}"
     scans.require(board(B))
+
+
+def test_the_steps_of_evidence_have_whole_milliseconds_and_the_failure_stands_apart() -> None:
+    steps = [StepResult("agree", "done", 0.0016), StepResult("sign", "nothing to do", 0.0004),
+             StepResult("write", "skipped"), StepResult("verify", "failed", 1.2506)]  # fmt: skip
+    assert _step_facts(steps) == (
+        ("agree", "done", 2), ("sign", "nothing to do", 0), ("write", "skipped", 0), ("verify", "done", 1251)
+    )  # fmt: skip
 
 
 def test_a_unit_belongs_to_its_job(owner: Station) -> None:

@@ -20,7 +20,7 @@ from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.protocol.plant.page import PageDraft, open_page, sign_page
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster
-from teds_provision.station.station import Station
+from teds_provision.station.station import Station, rewrap
 from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import make_station
 from tests.plant.owner import ALL, REGISTRY, alone, join, member, roster_of
@@ -151,6 +151,20 @@ def test_half_a_login_is_none(station: Station) -> None:
         assert station.plant.login() is None
         station._store.execute("INSERT INTO meta VALUES(?, ?)", (name, value))
         assert station.plant.login() == kept
+
+
+def test_the_secret_of_the_login_is_kept_under_the_newest_master_key(station: Station) -> None:
+    station.unlock()
+    request(station)
+    kept = station.plant.login()
+    assert kept is not None
+    for version in (1, 2):
+        [(wrapped,)] = station._store.execute("SELECT value FROM meta WHERE name = 'registry-login'")
+        assert str(wrapped).startswith(f"01{version:08x}")
+        assert station.plant.login() == kept
+        if version == 1:
+            with station.lock("test"):
+                rewrap(station)
 
 
 def test_a_request_of_another_name_is_made_anew_with_the_same_login(station: Station) -> None:

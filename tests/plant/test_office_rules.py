@@ -69,7 +69,7 @@ def test_a_request_is_judged_in_the_order_of_the_contract(desk: Desk) -> None:
         return reply.refused, reply.why
 
     assert refused(bad, by=base)[0] == "not-line"
-    assert refused(bad, jobs=[])[0] == "job"
+    assert refused(bad, jobs=[]) == ("job", "this office is not working on that job")
     assert refused(bad) == ("revoked", "the node was revoked: stolen")
     north.policy.forgive(board.uuid)
     assert refused(bad) == ("other-key", "this office knows the board with another key")

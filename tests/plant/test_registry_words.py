@@ -315,7 +315,9 @@ def test_leaving_says_what_it_means_and_changes_nothing_as_a_plan(home: Path) ->
         "Plan: Leave plant: this station stops publishing, and trusts every station that the CA certified again, "
         "removed ones included. It stays on the roster until the owner runs: registry remove\n"
     )
-    assert call(home, "registry", "disconnect").code == 6
+    assert call(home, "--json", "registry", "disconnect", "--dry-run").json == {"registry": REGISTRY, "plan": True}
+    asked = call(home, "registry", "disconnect")
+    assert (asked.code, asked.err.startswith(plan.out.removeprefix("Plan: "))) == (6, True), "before the question"
     with Station.inspect(home) as station:
         assert station.plant.joined is not None
     left = call(home, "registry", "disconnect", "--yes")

@@ -7,6 +7,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -770,6 +771,54 @@ def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:
     assert (error.value.message, error.value.hint) == (
         "office belongs to another registry (another).", "Use the one that this station joined."
     )  # fmt: skip
+
+
+def test_the_own_roster_is_posted_and_one_that_was_not_taken_is_a_remark(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, posted = station.plant.held_roster(), list[Any]()
+    assert held is not None
+    made = [(stub(version=number), how, f"why {number}") for number, how in enumerate(("taken", "older", "expired"), 5)]
+    monkeypatch.setattr(sync, "take_rosters", lambda _station, octets: made if octets == ["octets"] else [])
+    transport = stub(registry=lambda: None, rosters=lambda: ["octets"], post_roster=lambda *given: posted.append(given))
+    done: Any = stub(remarks=[])
+    assert sync._rosters(station, transport, done) == made
+    assert (posted, done.remarks) == ([(held.version, held.hash, held.octets)], ["roster 7: expired: why 7"])
+
+
+def test_a_sync_waits_for_another_one_under_its_own_name(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    course = list[Any]()
+
+    @contextmanager
+    def lock(home: Path, **how: Any) -> Iterator[None]:
+        course.append((home, how))
+        yield
+        course.append("free")
+
+    monkeypatch.setattr(sync, "StoreLock", lock)
+    with sync.sync_lock(station):
+        course.append("sync")
+    how = {"command": "registry sync", "notice": station.notice, "file": "registry.lock"}
+    assert course == [(station.home, how), "sync", "free"]
+
+
+@pytest.mark.parametrize(
+    ("pages", "follows"),
+    [
+        ((), True),
+        (((5, "h4", "h5"),), True),
+        (((6, "h5", "h6"), (5, "h4", "h5")), True),
+        (((6, "h5", "h6"),), False),
+        (((5, "other", "h5"),), False),
+        (((5, "h4", "h5"), (6, "other", "h6")), False),
+        (((5, "h4", "h5"), (7, "h5", "h7")), False),
+    ],
+)
+def test_pages_follow_without_a_gap_whatever_their_order(
+    pages: tuple[tuple[int, str, str], ...], follows: bool
+) -> None:
+    new = [stub(number=number, previous=previous, hash=hash) for number, previous, hash in pages]
+    assert sync._follows(stub(counted=(4, "h4")), new) is follows
 
 
 def test_pages_that_count_are_handed_in_before_all_others(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,6 +143,7 @@ def test_a_sync_that_a_wrong_clock_dated_ahead_has_no_negative_age(
         shown = watch.status()
         assert shown is not None
         assert (shown["synced"], shown["age"]) == (synced, age)
+        assert next(iter(watch.metrics())) == ("teds_registry_age_seconds", {}, age)
 
 
 def test_before_the_first_sync_there_is_no_age(station: Station) -> None:
@@ -279,6 +280,21 @@ def test_a_sync_that_fails_is_reported_by_its_kind_and_opens_its_way_once(
     ]
     assert (len(opened), changed) == (2, [])
     assert (watch.status() or {})["state"] == "alarm"
+
+
+def test_the_database_is_checked_at_the_first_sync_and_each_hour(home: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    transport, checks, clock = SimpleNamespace(), list[tuple[Any, ...]](), [0.0]
+    monkeypatch.setattr(connecting, "open_transport", lambda station: transport)
+    monkeypatch.setattr(connecting, "check_database", lambda *given: checks.append((clock[0], *given)))
+    monkeypatch.setattr(plant.sync, "sync", lambda *_: SyncResult())
+    monkeypatch.setattr(
+        "teds_provision.plant.service.time", SimpleNamespace(monotonic=lambda: clock[0], time=time.time)
+    )
+    watch, _, _ = watching(home.north)
+    for now in (0.0, 60.0, 3599.0, 3600.0, 7199.0, 7200.0):
+        clock[0] = now
+        watch._sync()
+    assert checks == [(now, home.north, transport) for now in (0.0, 3600.0, 7200.0)]
 
 
 @pytest.mark.parametrize(("busy", "seconds"), [(True, 2.0), (False, 60.0)])

@@ -112,6 +112,14 @@ def test_with_its_reading_a_node_that_was_reset_loses_its_firmware_report(statio
     assert (station.datasheets.reading(NODE), station.firmware_reports.get(NODE)) == (None, None)
 
 
+def test_the_firmware_report_of_one_node_is_forgotten_and_no_other(station: Station) -> None:
+    other = bytes(9) + b"x"
+    for uuid in (NODE, other):
+        station.firmware_reports.keep(uuid, bytes(42), in_session=True)
+    station.firmware_reports.forget(NODE)
+    assert [record.uuid for record in station.firmware_reports.all()] == [other]
+
+
 def test_a_report_in_a_session_is_dated_anew_though_a_hint_said_the_same(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:

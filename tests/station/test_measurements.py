@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -157,6 +158,32 @@ def test_of_two_measurements_of_a_group_the_newest_is_continued(station: Station
     assert continued is not None
     assert continued.rate == 200.0
     assert station.measurements.settings_to_continue("foot") is None
+
+
+def test_what_is_continued_is_of_its_group_not_past_its_end_and_of_no_living_command(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alive = {"running"}
+    monkeypatch.setattr(rows, "OwnerLock", lambda _home, id: SimpleNamespace(is_taken=id in alive))
+    monkeypatch.setattr(rows, "time", SimpleNamespace(time=lambda: 1000.0))
+    for group in ("hand", "foot"):
+        station.groups.put(Group(group, (ONE,)))
+    kept = [
+        ("first", "hand", "command", None), ("of ncap", "hand", "ncap", None), ("cut off", "hand", "command", None),
+        ("past", "hand", "page", 1000.0), ("running", "hand", "command", None), ("other", "foot", "ncap", None),
+    ]  # fmt: skip
+    for day, (id, group, owner, ends) in enumerate(kept, 1):
+        process: dict[str, Any] = {"pid": 41, "started": 999} if owner == "command" else {}
+        created = f"2026-10-0{day}T08:00:00Z"
+        station.measurements.keep(
+            KeptMeasurement(id, group=group, rate=day * 100.0, owner=owner, ends=ends, created=created, **process)
+        )
+    for id, rate in (("cut off", 300.0), ("of ncap", 200.0), ("first", 100.0)):
+        found = station.measurements.settings_to_continue("hand")
+        assert found is not None
+        assert (found.id, found.rate, found.owner, found.pid, found.started) == ("", rate, "command", None, None)
+        station.measurements.forget(id)
+    assert station.measurements.settings_to_continue("hand") is None
 
 
 def test_a_command_counts_while_it_lives_and_the_next_reader_removes_a_dead_one(

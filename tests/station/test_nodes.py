@@ -126,6 +126,18 @@ def test_a_renamed_node_leaves_its_old_name_although_the_whitelist_keeps_it(stat
     assert station.nodes.beginning_with("gr", 9) == []
 
 
+def test_names_and_uuids_that_begin_so_come_in_order_and_no_more_than_are_asked_for(station: Station) -> None:
+    first, second, third = (bytes.fromhex("ab" * 9 + end) for end in ("01", "02", "03"))
+    station.nodes.restore(NodeRecord(first, name="abel"))
+    station.nodes.restore(NodeRecord(second))
+    station.pins.restore([WhitelistEntry(first, name="abacus"), WhitelistEntry(third, name="abc")])
+    uuids = [(first.hex(), "abel"), (second.hex(), ""), (third.hex(), "abc")]
+    assert station.nodes.beginning_with("ab", 9) == [*uuids, ("abc", third.hex()), ("abel", first.hex())]
+    assert station.nodes.beginning_with("ab", 2) == uuids[:2]
+    for text in ("0xab", "0xABAB", "AB"):
+        assert station.nodes.beginning_with(text, 9) == uuids
+
+
 def test_a_name_that_two_nodes_have_is_ambiguous(station: Station) -> None:
     station.nodes.restore(NodeRecord(FINGER, name="twin"))
     station.nodes.restore(NodeRecord(JOINT, name="twin"))

@@ -160,3 +160,16 @@ def test_who_waits_for_a_person(fleet: Station) -> None:
     for number, c in readings.items():
         fleet.datasheets.keep_reading(NodeReading(uuid(number), AT, "verify", c, True, b""))
     assert waiting("2026-01-01")[3] == [2, 5, 6]
+
+
+def test_who_waits_longest_is_first_and_nodes_of_one_name_stand_together(fleet: Station) -> None:
+    for number in (21, 20):
+        fleet.nodes.restore(NodeRecord(uuid(number), due="2026-02-01"))
+    for number, name in ((31, "thumb"), (30, "palm"), (29, "alone")):
+        fleet.nodes.restore(NodeRecord(uuid(number), name=name))
+    for number in (5, 1):
+        fleet.datasheets.keep_draft(Draft(uuid(number), Image(uuid(number), {})))
+        fleet.keys.put_flags({uuid(number): KeyFlags(rotation="why")})
+    found = fleet.overview.waiting("2026-03-03", RowSample(full=True))
+    lists = (found.overdue, found.twice, found.drafts, found.rotations)
+    assert [[each[-1] for each in uuids] for uuids in lists] == [[20, 21, 2, 4], [3, 30, 2, 31], [1, 5], [1, 5]]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from teds_provision.station.plant import plant
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.pages import Chain, PageRow
 from teds_provision.station.plant.parcels import ParcelRow
@@ -18,7 +20,7 @@ from teds_provision.station.store.store import Store
 A, B, C, D = (bytes([number] * 10) for number in (1, 2, 3, 4))
 NORTH, SOUTH, WEST = "1a" * 32, "2b" * 32, "3c" * 32
 H1, H2, H3 = "d1" * 32, "d2" * 32, "d3" * 32
-EARLY, LATE = "2026-10-01T08:00:00Z", "2026-10-02T08:00:00Z"
+EARLY, AT, LATE = "2026-10-01T08:00:00Z", "2026-10-01T20:00:00Z", "2026-10-02T08:00:00Z"
 
 
 # -- parcels and copies ------------------------------------------------------------------------------------------------
@@ -288,6 +290,31 @@ def test_conflicts_take_the_place_of_those_that_were(station: Station) -> None:
     assert claims.conflicts(B) == [(B, "two keys", "one")]
     claims.put_conflicts({A: {}})
     assert claims.conflicts(A) == []
+
+
+@pytest.mark.parametrize(
+    ("of", "runs", "at", "other"),
+    [
+        ("line", "b", AT, True), ("line", "a", AT, False), ("line", "b", EARLY, False), ("line", "b", LATE, True),
+        ("line", "b", "2099-01-01T00:00:00Z", False), ("audit", "b", AT, False), ("gone", "b", AT, False),
+        ("none", "b", AT, False),
+    ],
+)  # fmt: skip
+def test_another_firmware_is_what_a_member_at_work_reported_since_then_and_not_in_the_future(
+    station: Station, monkeypatch: pytest.MonkeyPatch, of: str, runs: str, at: str, other: bool
+) -> None:
+    roles = {"line": {"line", "audit"}, "audit": {"audit"}, "gone": {"line"}}
+    roster = SimpleNamespace(
+        roles_of=lambda who: roles.get(who, set()), member=lambda who: who if who != "gone" else None
+    )
+    monkeypatch.setattr(type(station.plant), "roster", property(lambda _: roster))
+    monkeypatch.setattr(
+        station.plant.claims, "of_nodes", lambda uuids: {A: {"none": "", of: "said"}} if uuids == [A] else {}
+    )
+    read = lambda text: SimpleNamespace(firmware=(runs, at) if text else None)  # noqa: E731
+    monkeypatch.setattr(plant, "claim", SimpleNamespace(Claim=SimpleNamespace(from_json=read)))
+    monkeypatch.setattr(plant, "utc_now", lambda: LATE)
+    assert station.plant.reports_other_firmware(A, cast("Any", "a"), AT) is other
 
 
 # -- alarms ------------------------------------------------------------------------------------------------------------

@@ -227,7 +227,15 @@ def ban(uuid: bytes = A, key: str | None = KEY, statement: str = "h.p.s") -> Rev
 
 @pytest.mark.parametrize(
     ("banned", "asked", "denied"),
-    [(KEY, KEY, True), (KEY, OTHER, False), (KEY, None, True), (None, KEY, True), (None, None, True)],
+    [
+        (KEY, KEY, True),
+        (KEY, OTHER, False),
+        (KEY, None, True),
+        (None, KEY, True),
+        (None, None, True),
+        (KEY, KEY[:32], True),
+        (KEY, OTHER[:32], False),
+    ],
 )
 def test_a_ban_is_of_the_key_that_it_names(
     station: Station, banned: str | None, asked: str | None, denied: bool

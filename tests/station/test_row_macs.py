@@ -193,6 +193,14 @@ def test_the_mac_of_a_row_is_hmac_over_its_kind_and_values(length: int) -> None:
     assert not macs.is_key(bytes(KEY_OCTETS))
 
 
+def test_the_length_of_a_text_in_a_mac_counts_octets() -> None:
+    key, text = bytes(range(KEY_OCTETS)), "5 °C"
+    macs = RowMacs(lambda: pytest.fail("the vault is not asked"))
+    macs.use(key)
+    whole = b"kind\0" + b"\0\0\0" + bytes([5]) + text.encode()
+    assert macs.mac("kind", (text,)) == hmac.new(key, whole, hashlib.sha256).digest()[:MAC_OCTETS]
+
+
 def test_with_a_closed_vault_a_row_counts_and_holds_for_nobody() -> None:
     """Lists ask for no passphrase; what decides opens the vault first."""
     macs = RowMacs(lambda: pytest.fail("the vault is not asked"))

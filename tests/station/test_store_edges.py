@@ -445,6 +445,8 @@ def test_counts_and_what_is_wrong_with_the_file(store: Store, monkeypatch: pytes
         assert store.damage() == "The file is damaged."
         patch.setattr(store, "_checked", lambda _: "row 3 missing from index")
         assert store.damage() == "row 3 missing from index"
+        patch.setattr(Path, "stat", lambda _: SimpleNamespace(st_size=4097))
+        assert store.damage() == "The file ends within a page.", "SQLite would not find it"
     with monkeypatch.context() as patch:
         patch.setattr(Path, "stat", full)
         assert store.damage() == "The file cannot be read: No space left on device."
@@ -582,6 +584,12 @@ def test_a_usage_lock_shows_whether_its_last_holder_ended_well(place: Path) -> N
     assert path.read_bytes() == b""
     free = UsageLock(path, command="measure")
     assert (free.is_taken, free.holder, free.is_taken_alone) == (False, None, False)
+
+
+def test_the_folder_that_a_usage_lock_makes_is_its_owners_alone(place: Path) -> None:
+    for _ in range(2):
+        with UsageLock(place / "locks" / "n.lock", command="measure"):
+            assert (place / "locks").stat().st_mode & 0o777 == 0o700
 
 
 def test_a_full_disk_hides_neither_a_lock_nor_its_end(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
