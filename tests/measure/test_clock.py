@@ -386,3 +386,45 @@ def test_what_was_stamped_before_the_clock_was_set_is_moved_by_the_difference(mo
     assert host.set_anew() == -10.0
     assert [host.since(number) for number in (0, 1, 2)] == [50.0, -10.0, 0.0]
     assert host.present == (2, 1050.0)
+
+
+def test_a_lie_of_any_kind_moves_no_stamp_that_has_evidence() -> None:
+    node, clock = Node(0), ClockMap()
+    assert clock.exchange(node.exchange(BOOT + SECOND))
+    before = clock.host_of(3 * SECOND)
+    later = node.exchange(BOOT + 2 * SECOND)
+    for sent in (later.received - 1, later.received + SECOND):
+        assert not clock.exchange(replace(later, sent=sent))
+        assert clock.host_of(3 * SECOND) == before
+
+
+def test_without_evidence_the_nodes_last_tick_is_when_its_reply_was_whole() -> None:
+    clock = ClockMap()
+    assert not clock.exchange(Exchange(BOOT, BOOT + 3 * SECOND, 2 * SECOND, SECOND, 0, 0))
+    assert clock.host_of(SECOND) == (BOOT + 3 * SECOND) / 1e9
+
+
+@pytest.mark.parametrize(("drift", "ppm"), [(0, 150), (100, 150), (110, 160), (5000, 5050)])
+def test_a_bound_grows_by_the_drift_of_both_clocks_and_by_no_less_than_was_assumed(drift: int, ppm: int) -> None:
+    clock = ClockMap()
+    assert clock.exchange(Exchange(BOOT, BOOT, SECOND, SECOND, 0, drift))
+    first, last = (clock.lead_bounds(BOOT + seconds * SECOND) for seconds in (1, 11))
+    grown = (last.high - last.low) - (first.high - first.low)
+    assert grown == pytest.approx(2 * 10 * SECOND * ppm / 1e6, abs=10)
+
+
+def test_a_clock_without_resolution_replies_in_the_tick_of_the_request_and_none_is_292_years_old() -> None:
+    for sent, lies in ((SECOND, False), (2**63 - 1, False), (2**63, True)):
+        clock = ClockMap()
+        assert clock.exchange(Exchange(BOOT, BOOT, sent, sent, 0, 0)) is not lies
+        assert ("centuries" in clock.lie) is lies
+
+
+def test_the_bound_of_a_line_is_that_of_its_end_which_is_farther_from_the_evidence() -> None:
+    clock = ClockMap()
+    assert clock.exchange(Exchange(BOOT, BOOT, 100 * SECOND, 100 * SECOND, 0, 100))
+    for first, last, seconds in ((100, 110, 10), (90, 100, 10), (95, 120, 20), (80, 105, 20)):
+        assert clock.line(first * SECOND, last * SECOND)[2] == pytest.approx(150e-6 * seconds)
+    for skew in (1e-4, -1e-4):
+        clock._skew = skew
+        assert clock.line(100 * SECOND, 110 * SECOND)[2] == pytest.approx(250e-6 * 10), "a line may fall as well"

@@ -405,3 +405,36 @@ def test_rows_are_made_of_every_node_together_or_of_each_alone_where_nodes_come_
     assert made._for_grid == deque()
     made._grids, made._for_grid = {}, deque([block()])
     assert made._synchronized() == [], "its grid is gone"
+
+
+def test_rows_are_made_if_one_sink_wants_them_and_anew_if_one_channel_is_another() -> None:
+    shown: list[Any] = []
+    sinks: Any = [SimpleNamespace(wants_rows=wants, describe=lambda _facts: None) for wants in (False, True)]
+    made = measurement_of(supervisor_of(UUIDS[0]), sinks=sinks, watcher=measurement.Watcher(facts=shown.append))
+    made._lock, made._known, made._grids = threading.Lock(), {}, {}
+    described = [facts(UUIDS[0], 1), facts(UUIDS[0], 2)]
+    made._describe(described)
+    assert shown == [described]
+    grid = made._grids[""]
+    made._describe([facts(UUIDS[0], 1, unit="m"), facts(UUIDS[0], 2)])
+    assert made._grids[""] is not grid
+
+
+@pytest.mark.parametrize(("ran", "end"), [((True, False), 105.0), ((False, True), 105.0), ((False, False), math.inf)])
+def test_one_node_with_values_is_enough_for_the_seconds_to_count(ran: tuple[bool, bool], end: float) -> None:
+    streams = SimpleNamespace(first_sample=lambda: 0.0)
+    loop: Any = SimpleNamespace(
+        _common_start=SimpleNamespace(seconds_left=0.0), began=lambda: None,
+        supervisors=[SimpleNamespace(ever_ran=one, streams=streams) for one in ran],
+    )  # fmt: skip
+    assert Measurement._until(loop, 100.0, 5.0) == end
+
+
+def test_each_row_goes_to_every_sink() -> None:
+    written: list[tuple[str, str]] = []
+    sinks = [
+        SimpleNamespace(write_group=lambda rows, name=name: written.append((name, rows))) for name in ("file", "topic")
+    ]
+    made: Any = SimpleNamespace(_lock=threading.Lock(), _synchronized=lambda: ["first", "second"], sinks=sinks)
+    Measurement._rows(made)
+    assert written == [("file", "first"), ("topic", "first"), ("file", "second"), ("topic", "second")]

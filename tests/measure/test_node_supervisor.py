@@ -12,6 +12,7 @@ import pytest
 
 from teds_provision.errors import (
     BadDataError,
+    BadDatasheetError,
     GarbledError,
     KeyStolenError,
     LinkError,
@@ -24,7 +25,7 @@ from teds_provision.errors import (
 from teds_provision.measure import node_supervisor
 from teds_provision.measure.blocks import NodeReport, SetPointCommand
 from teds_provision.measure.clock import HostClock
-from teds_provision.measure.node_supervisor import LOOK, NodeSupervisor
+from teds_provision.measure.node_supervisor import CALM, LOOK, NodeSupervisor
 from teds_provision.measure.planning import BusShare
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running import measurement_job
@@ -881,7 +882,8 @@ def test_what_a_session_begins_with_counts_under_its_key_alone(monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    ("asked", "nodes", "lease"), [(2, 0, 2), (2, 10, 2), (2, 11, 3), (2, 12, 3), (2, 15, 3), (2, 16, 4), (9, 16, 9)]
+    ("asked", "nodes", "lease"),
+    [(2, 0, 2), (2, 10, 2), (2, 11, 3), (2, 12, 3), (2, 15, 3), (2, 16, 4), (9, 16, 9), (2, 300, 60), (2, 301, 60)],
 )
 def test_a_lease_is_no_shorter_than_a_fifth_of_a_second_for_each_node_of_the_bus(
     asked: int, nodes: int, lease: int
@@ -892,3 +894,145 @@ def test_a_lease_is_no_shorter_than_a_fifth_of_a_second_for_each_node_of_the_bus
     assert NodeSupervisor._lease_now(own) == lease
     own.bus = None
     assert NodeSupervisor._lease_now(own) == asked
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_node_is_on_its_way_while_its_session_begins_and_no_longer(
+    monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    """What was seen of it before the session raises no doubt about the session."""
+    supervisor = supervisor_at([100.0], monkeypatch)
+    supervisor._announced = supervisor._elsewhere = 90.0
+    bus: Any = SimpleNamespace(beginning={b"other"})
+    seen: list[Any] = []
+
+    def opens(*_words: Any) -> None:
+        seen.append((set(bus.beginning), supervisor._announced, supervisor._elsewhere))
+        if fails:
+            raise LinkError("It is silent.")
+
+    monkeypatch.setattr(supervisor, "_open_and_measure", opens)
+    none: Any = None
+    with pytest.raises(LinkError) if fails else nullcontext():
+        supervisor._in_session(bus, none, none)
+    assert seen == [({UUID, b"other"}, 0.0, 0.0)]
+    assert bus.beginning == {b"other"}
+
+
+def test_an_announce_from_before_the_session_was_open_raises_no_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session(monkeypatch)
+
+    def opens(*_words: Any, **_how: Any) -> Any:
+        session.supervisor._announced = 95.0
+        return session.trusted
+
+    monkeypatch.setattr(node_supervisor, "open_trusted", opens)
+    session.run()
+    assert session.supervisor._announced == 0.0
+
+
+def test_a_broadcast_that_cannot_be_sent_changes_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    supervisor, asked = supervisor_at([100.0], monkeypatch), list[int]()
+
+    def discover() -> None:
+        asked.append(1)
+        raise LinkError("The bus is gone.")
+
+    supervisor.bus = cast(Any, SimpleNamespace(discovery=SimpleNamespace(discover=discover)))
+    supervisor._ask_who_answers()
+    assert asked == [1]
+
+
+@pytest.mark.parametrize(
+    ("error", "ran", "states"),
+    [
+        (BadDatasheetError("It changed."), True, ["refused", "ended"]),
+        (BadDataError("Nonsense."), True, ["lost", "ended"]),
+        (BadDatasheetError("It changed."), False, ["waiting", "ended"]),
+        (None, True, ["ended"]),
+    ],
+)
+def test_a_failed_try_is_reported_as_what_it_is_and_the_next_one_is_no_later_than_the_last(
+    monkeypatch: pytest.MonkeyPatch, error: Exception | None, ran: bool, states: list[str]
+) -> None:
+    """None: it is stopped during the try, and the error of that is none."""
+    supervisor, seen, pauses = supervisor_at([0.0], monkeypatch), list[str](), list[float]()
+    policy = SimpleNamespace(gives_up=lambda *_, **__: False, seconds_left=0.25, next_try=lambda _pause: "soon")
+    monkeypatch.setattr(node_supervisor, "RetryPolicy", lambda _seconds: policy)
+    monkeypatch.setattr(supervisor, "_set_state", lambda state, *_, **__: seen.append(state))
+    monkeypatch.setattr(supervisor, "_buses", SimpleNamespace(all=list))
+    monkeypatch.setattr(supervisor, "_anew", SimpleNamespace(clear=lambda: None))
+    supervisor.ever_ran = ran
+
+    def failure() -> Exception:
+        if error is None:
+            supervisor._stop.set()
+        return error or LinkError("It is gone.")
+
+    def wait(pause: float, *_: float, **__: bool) -> None:
+        pauses.append(pause)
+        supervisor._stop.set()
+
+    monkeypatch.setattr(supervisor, "_failure", failure)
+    monkeypatch.setattr(supervisor, "_wait", wait)
+    supervisor._run()
+    assert (seen, pauses) == (states, [0.25] if error else [])
+
+
+@pytest.mark.parametrize(
+    ("rest", "announced", "elsewhere", "pause"),
+    [(False, 0.0, 0.0, CALM), (True, 0.0, 0.0, LOOK), (False, 9.0, 0.0, LOOK), (False, 0.0, 9.0, LOOK)],
+)
+def test_a_session_is_looked_at_more_often_while_there_is_something_to_find_out(
+    monkeypatch: pytest.MonkeyPatch, rest: bool, announced: float, elsewhere: float, pause: float
+) -> None:
+    supervisor, waits = supervisor_at([10.0], monkeypatch), list[float]()
+    anew = SimpleNamespace(wait=waits.append, set=lambda: None)
+    monkeypatch.setattr(supervisor, "_anew", anew)
+    monkeypatch.setattr(supervisor, "_doubted", lambda _now: False)
+    supervisor._announced, supervisor._elsewhere = announced, elsewhere
+    streams = SimpleNamespace(silent=lambda _now: 0.0, clock=SimpleNamespace(lie=""))
+    monkeypatch.setattr(supervisor, "streams", streams)
+    none: Any = None
+    standing: Any = SimpleNamespace(require=supervisor.stop, mark="")
+    supervisor._watch(none, none, standing, cast(Any, SimpleNamespace(step=lambda: True)) if rest else None)
+    assert waits == [pause]
+
+
+def test_a_lie_of_the_clock_and_a_datasheet_that_was_read_are_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    supervisor, states, done = supervisor_at([0.0], monkeypatch), list[Any](), list[bytes]()
+    steps, turns = iter([True, True, False]), iter(range(5))
+
+    def require() -> None:
+        if next(turns) == 4:
+            supervisor.stop()
+
+    monkeypatch.setattr(supervisor, "_events", SimpleNamespace(reread_done=done.append))
+    monkeypatch.setattr(supervisor, "_set_state", lambda state, why="": states.append((state, why)))
+    streams = SimpleNamespace(silent=lambda _now: 0.0, clock=SimpleNamespace(lie="it was set"))
+    monkeypatch.setattr(supervisor, "streams", streams)
+    none: Any = None
+    standing: Any = SimpleNamespace(require=require, mark="")
+    supervisor._watch(none, none, standing, cast(Any, SimpleNamespace(step=lambda: next(steps))))
+    assert done == [UUID]
+    assert states == [("running", "its clock is inconsistent: it was set")]
+
+
+def test_a_session_ends_after_the_command_that_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    supervisor, course = supervisor_at([0.0], monkeypatch), list[Any]()
+
+    class Turn:
+        def __enter__(self) -> None:
+            course.append(supervisor.verified)
+
+        def __exit__(self, *_why: object) -> None:
+            course.append(supervisor.verified)
+
+    trusted: Any = SimpleNamespace(node=SimpleNamespace(forget=lambda: None))
+    supervisor.verified, supervisor._comes_back = trusted, True
+    monkeypatch.setattr(supervisor, "turn", Turn())
+    monkeypatch.setattr(supervisor, "_buses", SimpleNamespace(presence=SimpleNamespace(let_announce=lambda _uuid: 0)))
+    monkeypatch.setattr(supervisor, "streams", SimpleNamespace(stop=lambda *_words: None))
+    none: Any = None
+    supervisor._end(none, trusted, 0x21, answers=False)
+    assert course == [trusted, None]

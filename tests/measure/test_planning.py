@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from teds_provision.errors import BadDataError, NoRoomError, PolicyError
 from teds_provision.links.ble.airtime import BleAirtime
 from teds_provision.links.can.airtime import CanAirtime
+from teds_provision.measure import planning
 from teds_provision.measure.planning import BusTime, NodePlans, period_of, plan_node, sensors_of
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.protocol.operation.stream_commands import StreamKind
@@ -112,6 +115,8 @@ def test_messages_hold_twenty_milliseconds_and_more_where_the_bus_is_short_of_ro
     assert slow.subscribe.n == 1
     [fuller] = plan_node(channels(0.001), BusTime(CanAirtime(50_000))).streams
     assert fuller.subscribe.n > 20
+    [full] = plan_node(channels(0.001), BusTime(CanAirtime(50_000)), start=7, test_pattern=True).streams
+    assert (full.subscribe.n, full.subscribe.start, full.subscribe.test_pattern) == (fuller.subscribe.n, 7, True)
     [event] = plan_node(channels(0.001, kind=ChannelKind.EVENT_SENSOR), BUS).streams
     assert (event.subscribe.n, event.subscribe.kind) == (1, StreamKind.EVENT)
 
@@ -174,3 +179,12 @@ def test_over_the_air_a_message_is_one_notification_of_mtu_less_4_octets_and_of_
     most = [most_instants(kind, 2, air.most_octets) for kind in (StreamKind.PERIODIC, StreamKind.EVENT)]
     assert most == [periodic, event]
     assert air.load(octets, 113, 100_000) == pytest.approx(88.5 / 160, rel=1e-3)
+
+
+@pytest.mark.parametrize(("load", "n"), [(MOST_LOAD / 2, 20), (MOST_LOAD * 0.51, 113)])
+def test_messages_of_a_stream_that_takes_more_than_half_of_the_bus_grow_up_to_what_they_hold(
+    load: float, n: int
+) -> None:
+    bus: Any = SimpleNamespace(airtime=SimpleNamespace(most_octets=240, load=lambda *_words: load))
+    plan = planning._plan(0, 1_000_000, StreamKind.PERIODIC, channels(0.001), bus, False, 7)
+    assert plan.subscribe.n == n

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 from teds_provision.errors import (
     BadDataError,
     LinkError,
+    NoRoomError,
     NotAuthenticError,
     NotFoundError,
     PolicyError,
@@ -35,6 +37,7 @@ from teds_provision.measure.running.measurement import Measurement
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.stream_receiver import HearingThread, ReceivedStream
 from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.provisioning.progress import DONE, NOTHING
 from teds_provision.station.store.records import KeptMeasurement
 
 UUID = bytes(range(10))
@@ -597,3 +600,65 @@ def test_a_node_that_may_not_be_measured_is_not_even_asked(monkeypatch: pytest.M
         with pytest.raises(PolicyError, match="Not listed"):
             opens(NONE, node, by="measure")
         assert order == ["require_measurable"]
+
+
+@pytest.mark.parametrize(("octets", "profile"), [(12, "joint"), (0, ""), (0, None)])
+def test_a_zero_is_signed_written_verified_and_read_once_more_by_the_new_datasheet(
+    monkeypatch: pytest.MonkeyPatch, octets: int, profile: str | None
+) -> None:
+    steps, given, sampled, logged = dict[str, Any](), dict[str, Any](), list[Any](), list[Any]()
+
+    def step(name: str) -> Any:
+        steps[name] = SimpleNamespace(detail="", result="", verdict="")
+        steps[name].take_verdict = lambda verdict: setattr(steps[name], "verdict", verdict)
+        return nullcontext(steps[name])
+
+    def write(_station: Any, _node: Any, image: Any, **how: Any) -> Any:
+        given.update(how, image=image)
+        return SimpleNamespace(octets=octets, on_node="on the node")
+
+    def take(trusted: Any, number: int, **how: Any) -> Any:
+        sampled.append((trusted, number, how))
+        return SimpleNamespace(calibrated=lambda: "samples")
+
+    own, channel = "the new curve", SimpleNamespace(number=1, si_unit="rad", full_turn=True)
+    for name, made in {
+        "SignedNodeKey": lambda *words: words,
+        "sign": lambda *_, **how: SimpleNamespace(sequence=how["node_sequence"] + 1, image="signed"),
+        "write": write,
+        "judge_and_keep": lambda *_, **how: SimpleNamespace(verified=SimpleNamespace(verdict="authentic"), **how),
+        "NodeVerification": lambda on_node, judged: on_node,
+        "trusted_from": lambda _station, _node, looked: looked,
+        "_adjustable": lambda _trusted, _number: (channel, own),
+        "turn_of": lambda curve, *, full_turn: (curve, full_turn),
+        "take_samples_of": take,
+        "reading_of": lambda values, turn: SimpleNamespace(mean=0.25, values=(values, turn)),
+        "_si": lambda _channel, curve, value: (curve, value),
+    }.items():
+        monkeypatch.setattr(zero, name, made)
+    record = None if profile is None else SimpleNamespace(profile=profile)
+    station = SimpleNamespace(
+        nodes=SimpleNamespace(get=lambda _uuid: record), audit=lambda *words, **more: logged.append((words, more))
+    )
+    node = SimpleNamespace(uuid=UUID, proven=SimpleNamespace(epoch=1, sequence=7), open_counter=3)
+    visit = SimpleNamespace(station=station, node=node, who=SimpleNamespace(point=b"point", key_signature=b"signature"))
+    ways = SimpleNamespace(step=step, done=["all"], reporter=SimpleNamespace(written="progress"))
+    found = zero.ZeroResult(UUID, channel, 0.5, 0.1, 0.2, 0.3, 0.0, 32, 7, (), ("a draft",), (), False)  # type: ignore[arg-type]
+    run: Any = SimpleNamespace(visit=visit, steps=ways, low="low")
+    done = zero._ZeroRun._bring(run, NONE, found)
+    assert done == replace(found, after=(own, 0.25), sequence=8, steps=("all",), written=True)  # type: ignore[arg-type]
+    facts = {"profile": profile} if profile else {}
+    assert given == {"image": "signed", "progress": "progress", "facts": facts, "low": "low"}
+    assert (steps["sign"].detail, steps["write"].detail) == ("sequence 8", f"{octets} octets")
+    assert (steps["write"].result, steps["verify"].verdict) == (DONE if octets else NOTHING, "authentic")
+    assert sampled == [("on the node", 1, {"count": 16, "seconds": 0.0})]
+    assert logged == [(("zero", UUID, "done"), {"channel": 1, "offset": 0.5, "unit": "rad", "sequence": 8})]
+
+
+def test_a_newcomer_for_which_the_bus_has_no_room_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    reports: list[Any] = []
+    made = _supervisor(reports, newcomers=True)
+    monkeypatch.setattr(made, "_failure", lambda: NoRoomError("The bus is full."))
+    monkeypatch.setattr(made, "_is_shared", lambda _error: None)
+    made._run()
+    assert [(report.state, report.why) for report in reports] == [("waiting", "no room on the bus")]

@@ -339,3 +339,26 @@ def test_of_set_points_that_wait_the_newest_is_applied() -> None:
     scene.actuators.close()
     assert [round(float(block.value[0, 0]), 3) for block in scene.applied] == [0.01, 0.04]
     assert scene.actuators.refused == 0, "another node's actuator is not refused here"
+
+
+def test_ten_set_points_are_fast_if_they_come_more_often_than_fifty_a_second() -> None:
+    exact = [number / 50 for number in range(10)]
+    for came, fast in ((exact, False), ([*exact[:9], 0.179], True), (exact[:9], False)):
+        actuator: Any = topic_actuators._Actuator(None)  # type: ignore[arg-type]
+        actuator.came.extend(came)
+        assert actuator.fast is fast
+
+
+def test_of_each_actuator_the_newest_set_point_that_waits_is_applied() -> None:
+    applied: list[tuple[int, float]] = []
+    made: Any = SimpleNamespace(_news=threading.Condition(), _newest={}, _stop=False)
+
+    def apply(command: SetPointCommand) -> None:
+        applied.append((command.channel, command.value))
+        made._stop = True
+
+    made._apply = apply
+    for number, value in ((1, 0.1), (2, 0.2), (1, 0.3)):
+        made._newest[number] = SetPointCommand(SHEET.uuid.hex(), number, value, 0.0)
+    TopicActuators._run(made)
+    assert applied == [(1, 0.3), (2, 0.2)]

@@ -198,6 +198,10 @@ WHY = {"channel": 2, "why": "too high", "count": 3}
              "invalid_why": [5, {**WHY, "channel": "2"}, {**WHY, "count": None}, {"why": "x"}, WHY]},
             NodeReport(A, "running", "", time=0.0, invalid_why=(InvalidValues(2, "too high", 3),)),
         ),
+        (
+            {"uuid": A, "state": "lost", "why": "x" * 1001, "invalid_why": [{**WHY, "why": "y" * 1001}] * 1001},
+            NodeReport(A, "lost", "x" * 1000, time=0.0, invalid_why=(InvalidValues(2, "y" * 1000, 3),) * 1000),
+        ),
         ({"uuid": "x" * 1000, "state": "lost"}, NodeReport("x" * 1000, "lost", "", time=0.0)),
         ({"uuid": "x" * 1001, "state": "lost"}, None),
         ({"uuid": A, "state": "gone"}, None),

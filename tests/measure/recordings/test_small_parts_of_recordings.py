@@ -16,13 +16,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from teds_provision.errors import BadDataError
-from teds_provision.measure.blocks import Block, GroupRows, Note, StationFacts
+from teds_provision.measure.blocks import Block, GroupRows, NodeReport, Note, StationFacts
 from teds_provision.measure.display_units import UnitConversion, in_display_units, in_si_units
 from teds_provision.measure.recordings import columns, converting, source, text
 from teds_provision.measure.recordings.columns import part_of
 from teds_provision.measure.recordings.mcap import McapRecording
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.recordings.parquet import ParquetRecording, ParquetWriter, _exact
+from teds_provision.measure.recordings.summary import RecordingSummary
 from teds_provision.measure.recordings.text import TextRecording
 from teds_provision.teds.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, HAND, STATION, block
@@ -325,3 +326,25 @@ def test_a_conversion_to_parquet_that_fails_closes_its_file(tmp_path: Path, monk
     with pytest.raises(BadDataError):
         converting._as_parquet(tmp_path / "run.parquet", iter([block()]), recording, wide=False, units="si")
     assert closed == [1]
+
+
+def test_the_log_of_a_parquet_file_is_read_as_far_as_it_is_one(tmp_path: Path) -> None:
+    made = _parquet(tmp_path / "run.parquet", [block()])
+    made._log = [5, None, {"event": "note", "why": "moved"}, {"event": "status", "uuid": 7}]
+    entries = list(made.entries())
+    assert [entry for entry in entries if isinstance(entry, Note)] == [Note(0.0, "moved")]
+    assert entries[-1] == Note(0.0, "moved")
+
+
+def test_a_missing_raw_text_is_no_octets() -> None:
+    large = 2**70
+    assert _exact(pa.array(["7", None, "ff00", "", str(large)])).tolist() == [7, b"", b"\xff\0", b"", large]
+
+
+def test_counts_that_began_anew_in_this_file_are_not_negative() -> None:
+    """A measurement that is begun again into the same file counts from 0."""
+    summary = RecordingSummary()
+    summary.add_entry(NodeReport(ARM, "running", samples=100, lost=5, late=4, bad=3, invalid=2))
+    last = NodeReport(ARM, "ended", samples=130, lost=1, late=6, bad=0, invalid=2)
+    found = summary._of_this_file(last)
+    assert (found.samples, found.lost, found.late, found.bad, found.invalid) == (30, 0, 2, 0, 0)

@@ -1083,3 +1083,35 @@ def test_what_stands_for_something_else_cannot_be_chosen_for_a_channel(name: str
         return
     with pytest.raises(UsageError, match=f"is the topic of {by} already"):
         topics.require_free(ARM, 1, name)
+
+
+def test_an_end_with_its_reason_is_in_order_and_a_clock_error_of_0_is_one() -> None:
+    sink = Carrier()
+    sink._prepare((ANGLE,), STATION)
+    entry = sink._status(NodeReport(ARM, "ended", "by pid 5", samples=7, clock_error=0.0))
+    assert (entry.level, entry.message) == (OK, "by pid 5")
+    assert ("clock error [s]", "0") in entry.values
+    assert sink._status(NodeReport(ARM, "ended", "by pid 5", late=1)).level == WARN
+    assert sink._status(NodeReport(ARM, "running", "its clock is inconsistent")).level == WARN
+
+
+def test_facts_that_give_their_node_another_name_are_announced_once() -> None:
+    sink = Carrier()
+    sink._prepare((ANGLE,), STATION)
+    sink._announce([ANGLE])
+    renamed = replace(ANGLE, chosen=((0, "left"),))
+    assert sink._learn((renamed,)) == [renamed]
+
+
+def test_of_a_block_its_last_instant_is_published_with_its_time() -> None:
+    sent: list[Any] = []
+    made: Any = SimpleNamespace(
+        _joints=["a joint"], _newest={}, _scalar=lambda *words: sent.append(words), _went=lambda _values: None
+    )
+    scalars: Any = SimpleNamespace(channels=[(0, "/bench/arm/angle", meaning_of(ANGLE), "arm", 0.5)], compounds=[])
+    given = block([[1], [2], [3]], start=100.0)
+    TopicSink._publish(made, given, scalars)
+    assert [(topic, stamp, value, variance) for topic, _, stamp, _, value, variance in sent] == [
+        ("/bench/arm/angle", float(given.time[2]), pytest.approx(0.3), 0.5)
+    ]
+    assert made._newest == {(ARM, 1): pytest.approx(0.3)}

@@ -6,11 +6,13 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from teds_provision.describe.asset_shell import asset_shell
 from teds_provision.errors import TedsProvisionError, UsageError
-from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.blocks import Block, GroupRows, NodeReport
+from teds_provision.measure.sinks import base
 from teds_provision.measure.sinks.base import ThreadedSink
 from teds_provision.measure.sinks.foxglove_server import FoxgloveServer, MeasurementTopics, _listener
 from teds_provision.measure.sinks.mqtt import MqttSink
@@ -304,3 +306,64 @@ def test_a_recorder_takes_up_to_64_items_at_a_time_and_a_live_sink_one() -> None
         while sink._items:
             sink._next()
         assert sink._next() == ([], True)
+
+
+def test_what_was_read_of_a_sink_does_not_change_with_it() -> None:
+    sink = DeskSink()
+    before = sink.stats
+    sink._count(written=5, dropped=2, octets=7, messages=1)
+    assert (before.written, before.dropped, before.octets, before.messages) == (0, 0, 0, 0)
+    after = sink.stats
+    assert (after.written, after.dropped, after.octets, after.messages) == (5, 2, 7, 1)
+
+
+def test_the_oldest_rows_go_as_the_oldest_blocks_do_and_facts_before_them_stay() -> None:
+    sink = DeskSink()
+    rows = GroupRows("all", ((ARM, 1),), np.array([1.0, 2.0]), np.ones((2, 1)), np.zeros((2, 1)))
+    sink.wants_rows = True
+    sink.report(NodeReport(ARM, "running"))
+    sink.write_group(rows)
+    sink.write(block())
+    sink._owed = 10
+    sink._drop_oldest()
+    left = [type(item) for _, _, item in sink._items]
+    assert left == [NodeReport, Block]
+    values = sink.stats.dropped
+    assert (values > 0, sink._owed) == (True, 10 - values)
+
+
+def test_a_topic_of_foxglove_has_one_channel_that_each_measurement_has_a_part_in() -> None:
+    server, _, (first, second) = served()
+    made: list[Any] = []
+
+    def channel(topic: str, **how: Any) -> Any:
+        made.append((topic, how["schema"], how["message_encoding"], how["metadata"]))
+        return SimpleNamespace(topic=topic)
+
+    server._sdk.Schema = lambda **how: how
+    server._sdk.Channel = channel
+    one, other = (server.channel(topics, "/a", "k/K", "float64 x", {"unit": "rad"}) for topics in (first, second))
+    assert one is other
+    schema = {"name": "k/K", "encoding": "ros2msg", "data": b"float64 x"}
+    assert made == [("/a", schema, "cdr", {"unit": "rad"})]
+    assert first.channels == second.channels == {"/a": one}
+
+
+@pytest.mark.parametrize("recorder", [False, True])
+def test_a_live_sink_rests_when_nothing_waits_and_every_sink_looks_at_the_clock_while_items_come(
+    monkeypatch: pytest.MonkeyPatch, recorder: bool
+) -> None:
+    now, rested, looked = [0.0], list[float](), list[float]()
+    turns: Any = iter([(["a"], False), (["b"], False), ([], True)])
+
+    def take(_item: Any) -> None:
+        now[0] += 0.6 * base.TICK
+
+    monkeypatch.setattr(base, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=rested.append))
+    made: Any = SimpleNamespace(
+        recorder=recorder, _items=(), _closing=False, _next=lambda: next(turns), _guarded_item=take,
+        _guarded_idle=looked.append,
+    )  # fmt: skip
+    ThreadedSink._run(made)
+    assert rested == ([] if recorder else [base.LIVE_REST] * 2)
+    assert looked == [pytest.approx(1.2 * base.TICK)] * 2

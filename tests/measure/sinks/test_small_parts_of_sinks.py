@@ -24,7 +24,7 @@ from teds_provision.measure.sinks.files import Part
 from teds_provision.measure.sinks.foxglove import FoxgloveSink
 from teds_provision.measure.sinks.json_lines import JsonLinesSink
 from teds_provision.measure.sinks.mcap import recording as of_mcap
-from teds_provision.measure.sinks.mcap.recording import McapSink
+from teds_provision.measure.sinks.mcap.recording import CHUNK_OCTETS, FLUSH, McapSink
 from teds_provision.measure.sinks.mcap.recover import Damage, _Scan, recover
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.names import Topics
@@ -573,3 +573,25 @@ def test_the_time_of_a_value_has_microseconds() -> None:
     made._connected.set()
     MqttSink._block(made, block(np.array([[7]]), start=1.123456789, period=0.0))
     assert sent == [("bench/arm", {"time": 1.123457, "angle_1": 0.7})]
+
+
+@pytest.mark.parametrize(
+    ("octets", "seconds", "closed", "opened"),
+    [
+        (0, 50.0, 0, 100.0), (1, FLUSH, 1, 100.0), (1, FLUSH / 2, 0, None), (CHUNK_OCTETS, 0.0, 1, 100.0),
+        (CHUNK_OCTETS - 1, 0.0, 0, None),
+    ],
+)  # fmt: skip
+def test_a_chunk_is_closed_when_it_is_full_or_old_and_its_age_counts_from_its_first_message(
+    octets: int, seconds: float, closed: int, opened: float | None
+) -> None:
+    done: list[int] = []
+    out = SimpleNamespace(chunk_octets=octets, close_chunk=lambda: done.append(1))
+    made: Any = SimpleNamespace(_out=out, _opened=0.0)
+    McapSink._look(made, seconds)
+    assert (len(done), made._opened) == (closed, 0.0 if opened is None else seconds)
+
+
+def test_a_deviation_of_0_is_none_and_the_uncertainty_counts() -> None:
+    facts = ChannelFacts(ARM, "arm", 1, "angle", "sensor", uncertainty=0.3, deviation=0.0)
+    assert vectors.variance_of(facts) == pytest.approx(0.03)
