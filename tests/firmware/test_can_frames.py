@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 
 import pytest
@@ -153,6 +154,18 @@ def test_an_answer_to_everyone_has_the_form_of_the_question(bus: Bus, fd: bool, 
     ((frame, form),) = bus.says()
     assert form == fd
     assert frame.startswith("001b42" if fd else "101b42")
+
+
+def test_without_randomness_the_wait_of_an_answer_to_everyone_follows_from_the_uuid(bus: Bus) -> None:
+    """Nodes that start together must not answer together: both halves of the CRC-32 of the UUID, of 2^16, of 50 ms."""
+    crc = zlib.crc32(UUID)
+    bus.node.chip_fails(1)
+    bus.node.take_frame(EVERYONE | 0xF1, bytes.fromhex("0742" + IDENTIFY), fd=True)
+    wait = (50_000_000 >> 16) * ((crc ^ crc >> 16) & 0xFFFF) / 1e9
+    bus.now += wait - 1e-5
+    assert bus.says() == []
+    bus.now += 2e-5
+    assert bus.says()[0][0].startswith("001b42")
 
 
 def test_a_long_request_in_fd_beside_a_classic_answer_to_everyone_is_asked_on_in_fd(bus: Bus) -> None:

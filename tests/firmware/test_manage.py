@@ -743,6 +743,17 @@ def test_a_reset_by_hand_in_factory_state_writes_nothing() -> None:
     assert desk.node.identity().state == 0
 
 
+def test_a_reset_by_hand_that_flash_refuses_is_an_error_and_ends_no_session() -> None:
+    desk = Board.make().keyed()
+    desk.node.fails(True)
+    with pytest.raises(AssertionError):
+        desk.node.reset_by_hand()
+    desk.node.fails(False)
+    assert desk.sealed(Command(0, 128, ABOUT, b"")).ok
+    desk.node.reset_by_hand()
+    assert desk.node.identity().state == 0
+
+
 def test_an_unconfirmed_trial_restarts_after_ten_minutes() -> None:
     desk = Board.make().keyed()
     desk.firmware.flags = SIGNED | ON_TRIAL

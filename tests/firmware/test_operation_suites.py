@@ -107,6 +107,7 @@ def test_operate_in_its_order() -> None:
         [
             ("a channel that is not there, all else wrong too", operate(9, **bad), Reason.UNKNOWN_COMMAND),
             ("every channel at once", Command(0xFFFF, 4, 1, bytes(17)), Reason.UNKNOWN_COMMAND),
+            ("channel 257", Command(257, 4, 1, operate(1, **bad).payload), Reason.UNKNOWN_COMMAND),
             ("a sensor with a dead-man", operate(1, **bad, dead_man=500), Reason.BAD_FORM),
             ("an actuator without one", operate(4, **bad), Reason.BAD_FORM),
             ("another datasheet", operate(2, **bad), Reason.DIGEST_MISMATCH),

@@ -2572,6 +2572,83 @@ PATTERNS = (
     ),
     # the node
     Pattern(
+        "an address is known once to every node of its bus",
+        "EndpointTable.record_use",
+        "1 <= source <= LAST_NODE and source not in self._known",
+        "1 <= source <= LAST_NODE",
+        "tests/node/test_can_without_bus.py",
+    ),
+    Pattern(
+        "lost messages are reported at the end of the stream at once",
+        "VirtualNode._report_missed",
+        "now >= self._report_at or not streaming",
+        "now >= self._report_at",
+        "tests/node/test_virtual_edges.py",
+    ),
+    Pattern(
+        "an empty text of a value table is one",
+        "WrappedChannel.shown",
+        "text is not None",
+        "text",
+        "tests/node/test_wrapped_description.py",
+    ),
+    Pattern(
+        "a range with one end is none",
+        "SourceChannel.span",
+        "math.isfinite(self.low) and math.isfinite(self.high)",
+        "math.isfinite(self.low)",
+        "tests/node/test_sources.py",
+    ),
+    Pattern(
+        "the scans of a buffer are a period apart",
+        "IioReader._read_buffer",
+        "newest - (count - 1 - number) * self._device.period",
+        "newest",
+        "tests/node/test_wrapped_readers.py",
+    ),
+    Pattern(
+        "a slow channel keeps four values",
+        "LatestValues.__init__",
+        "max(_LEAST_KEPT, math.ceil(_KEPT_SECONDS / channel.period))",
+        "math.ceil(_KEPT_SECONDS / channel.period)",
+        "tests/node/test_wrapped_readers.py",
+    ),
+    Pattern(
+        "an out-of-band record names the kind of its address",
+        "out_of_band_record",
+        "bytes((random,))",
+        "bytes((1,))",
+        "tests/node/test_tnep.py",
+    ),
+    Pattern(
+        "a UID that a tag draws begins with 08",
+        "NfcServer.__init__",
+        "b'\\x08' + os.urandom(3)",
+        "os.urandom(4)",
+        "tests/node/test_emulated_tags.py",
+    ),
+    Pattern(
+        "the name of a device is one line",
+        "described",
+        "' '.join((objects.device_information.product_name or path.stem).split())",
+        "objects.device_information.product_name or path.stem",
+        "tests/node/test_wrapped_devices.py",
+    ),
+    Pattern(
+        "no link key of another length goes into a bundle",
+        "_NodeWriter.checked_json",
+        "len(node.key) == 16",
+        "True",
+        "tests/protocol/test_bundle.py",
+    ),
+    Pattern(
+        "who only signs holds no key",
+        "_holders",
+        "roster.roles_of(holder) & {'line', 'base', 'keeper'}",
+        "roster.roles_of(holder)",
+        "tests/plant/test_sharing.py",
+    ),
+    Pattern(
         "a Request dies after 60 s", "AgreementSlot.confirm", "self._clock() - pending.at >= PENDING_SECONDS", "False"
     ),
     Pattern(
@@ -6136,6 +6213,20 @@ C_PATTERNS = (
         "i < session->drive.count; i++) {\n        if (ahead >",
         "i < 1; i++) {\n        if (ahead >",
         "tests/firmware/test_operation_suites.py",
+    ),
+    CPattern(
+        "a value is written to no channel beyond 255",
+        "operation.c",
+        "uint8_t pair[256];\n    int place = command->channel >= 1 && command->channel <= 255 ?",
+        "uint8_t pair[256];\n    int place = command->channel >= 1 ?",
+        "tests/firmware/test_operation_suites.py",
+    ),
+    CPattern(
+        "without randomness a wait follows from both halves of the CRC of the UUID",
+        "can.c",
+        "crc ^ crc >> 16",
+        "crc",
+        "tests/firmware/test_can_frames.py",
     ),
     CPattern(
         "a padding has an octet or more", "session.c", "count == 0 || ", "", "tests/firmware/test_protocol_suites.py"

@@ -18,7 +18,7 @@ from teds_provision.links.can.bus import Frame
 from teds_provision.node.can import endpoint as endpoint_module
 from teds_provision.node.can import server as server_module
 from teds_provision.node.can.endpoint import CanEndpoint
-from teds_provision.node.can.server import CanServer
+from teds_provision.node.can.server import CanServer, EndpointTable
 from teds_provision.node.worker_pool import JobQueue
 from teds_provision.protocol.announce import uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
@@ -447,3 +447,23 @@ def test_a_data_frame_leaves_for_a_node_of_this_bus_alone(clock: list[float]) ->
     for address in (0x23, 0x24):
         server.heard(0x1CFF0000 | address, f"0101{uuid_crc(LOW).to_bytes(4, 'big').hex()}0000")
     assert beside.address == 0x26, "0x25 was heard from the other node of this process"
+
+
+def test_an_address_from_which_a_frame_came_is_known_to_every_node_of_the_bus_once() -> None:
+    heard: list[tuple[str, int]] = []
+    endpoints: Any = [
+        SimpleNamespace(
+            address=number,
+            spoken_from=set(),
+            claim=SimpleNamespace(hear=lambda source, name=name: heard.append((name, source))),
+        )
+        for number, name in enumerate("ab", 5)
+    ]
+    table = EndpointTable(endpoints, lambda *_: None, lambda _: None, lambda _: None, echoes=False)
+    for source in (0, 1, 0xEF, 0xF0, 0xF1, 1):
+        table.record_use(source)
+    assert heard == [("a", 1), ("b", 1), ("a", 0xEF), ("b", 0xEF)]
+    heard.clear()
+    for endpoint, source in ((0, 5), (0, 5), (1, 6), (0, 7)):
+        table.speaks(endpoints[endpoint], 0x18DAF100 | source)
+    assert heard == [("b", 5), ("a", 6), ("b", 7)], "nobody hears its own"

@@ -139,6 +139,10 @@ def test_a_type_2_tag_has_the_layout_of_the_nhs31xx() -> None:
     assert memory.answer(bytes((0x30, 132))) == b"\x00"
 
 
+def test_a_type_2_tag_has_room_for_499_octets_at_most() -> None:
+    assert [Type2Memory(UID, most).max_ndef for most in (100, 499, 500)] == [100, 499, 499]
+
+
 def test_page_6_with_a_length_completes_a_message() -> None:
     memory, written = Type2Memory(UID), []
     memory.written = written.append
@@ -277,6 +281,16 @@ def test_a_tag_is_activated_by_its_uid(
     assert offer.brty == "106A"
     assert (offer.sens_res.hex(), offer.sdd_res.hex(), offer.sel_res.hex()) == (sens, uid, sak)
     assert log == []
+
+
+@pytest.mark.parametrize(("tag", "first", "octets"), [("4", 0x08, 4), ("2", 0x02, 7)])
+def test_a_tag_that_is_given_no_uid_draws_one(
+    monkeypatch: pytest.MonkeyPatch, tag: Any, first: int, octets: int
+) -> None:
+    """ISO/IEC 14443-3: 08 begins a random UID of four octets; 02 is a maker's number, as one of seven begins."""
+    uids = [served(monkeypatch, None, tag=tag)[0].offers[0].sdd_res for _ in range(2)]
+    assert [(uid[0], len(uid)) for uid in uids] == [(first, octets)] * 2
+    assert uids[0] != uids[1], "once in 16 million runs they are equal"
 
 
 def test_the_node_learns_when_the_field_comes_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:

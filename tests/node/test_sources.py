@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import sys
@@ -73,6 +74,11 @@ def test_a_period_has_a_unit_or_is_in_seconds_and_is_10_s_if_none_is_given() -> 
     assert make_source("sine", PLACES, print).at(1, 2.5).value == pytest.approx(180.0)
 
 
+@pytest.mark.parametrize(("low", "high"), [(math.nan, math.nan), (2.0, math.nan), (-math.inf, 5.0), (2.0, math.inf)])
+def test_a_range_with_one_end_is_none(low: float, high: float) -> None:
+    assert SourceChannel(1, "bare", low, high).span == (0.0, 1.0)
+
+
 def test_noise_fills_the_range_of_its_channel() -> None:
     noise = make_source("noise", PLACES, print)
     force = [noise.at(2, 0.0).value for _ in range(50)]
@@ -90,6 +96,7 @@ def test_noise_fills_the_range_of_its_channel() -> None:
         ("sine:-1", UsageError),
         ("ramp:fast", UsageError),
         ("ramp:nan", UsageError),
+        ("sine:inf", UsageError),
         ("noise:3", UsageError),
         ("unix:", UsageError),
         ("exec:", UsageError),

@@ -308,3 +308,9 @@ def test_a_charging_reader_that_writes_its_power_disturbs_nothing(desk: Desk) ->
     assert tnep.status_of(desk.exchange(select())) == tnep.SUCCESS
     power = message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])
     assert tnep.status_of(desk.exchange(power)) == tnep.PROTOCOL_ERROR, "a reader that has selected asks"
+
+
+@pytest.mark.parametrize(("random", "kind"), [(False, "00"), (True, "01")])
+def test_an_out_of_band_record_has_the_address_backwards_and_its_kind(random: bool, kind: str) -> None:
+    record = charging.out_of_band_record(bytes.fromhex("C1D857000102"), random=random)
+    assert record.payload.hex() == f"081b02010057d8c1{kind}021c00"

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NodeSilentError, StoreError, UsageError
-from teds_provision.node import flash_file
+from teds_provision.node import flash_file, virtual
 from teds_provision.node.ble import address as ble_address
 from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
@@ -84,6 +84,28 @@ def test_a_node_without_channels_has_no_clock_no_claims_and_nothing_to_do(node: 
     node.trigger("can:f1", bytes(8), 0)
     node.drive("can:f1", b"\0")
     node.unheard("can:f1")
+
+
+def test_data_messages_that_were_lost_are_reported_every_ten_seconds_and_the_rest_at_the_end(
+    node: VirtualNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reports: list[str] = []
+    board: Any = SimpleNamespace(notify=reports.append)
+    uuid = node.tim.flash.uuid
+    clock = [0.0]
+    monkeypatch.setattr(virtual, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    steps = [
+        (100.0, 0, True), (100.0, 3, True), (109.9, 4, True), (110.0, 5, True), (110.1, 5, True), (112.0, 6, True),
+        (113.0, 7, False), (113.1, 7, False), (113.2, 9, False), (123.1, 10, True), (123.2, 11, True),
+    ]  # fmt: skip
+    for clock[0], missed, streaming in steps:
+        tim = SimpleNamespace(missed=missed, streaming=streaming, flash=SimpleNamespace(uuid=uuid))
+        monkeypatch.setattr(node, "tim", tim)
+        node._report_missed(board)
+    assert reports == [
+        f"{more} data messages of node {uuid.hex()} could not be sent in time ({missed})."
+        for more, missed in ((3, 3), (2, 5), (2, 7), (2, 9), (2, 11))
+    ]
 
 
 # -- Bluetooth ---------------------------------------------------------------------------------------------------------

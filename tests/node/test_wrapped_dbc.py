@@ -232,6 +232,15 @@ def test_a_message_without_a_cycle_time_has_100_ms_and_a_note(tmp_path: Path, cy
         assert sensor.notes == ((note,) if noted else ())
 
 
+@pytest.mark.parametrize(
+    ("comment", "title"),
+    [("", "One"), ("Torque cell", "Torque cell"), ("Cell\n of the left arm", "Cell"), ("x" * 61, "x" * 60)],
+)
+def test_people_call_a_message_by_the_first_line_of_its_comment(tmp_path: Path, comment: str, title: str) -> None:
+    sensor = written(tmp_path, ' SG_ x : 0|8@1+ (1,0) [0|0] "V" A', f'CM_ BO_ 100 "{comment}";').sensor
+    assert (sensor.title, sensor.origin.name) == (title, "One")
+
+
 def test_a_file_of_windows_tools_has_its_units_too(tmp_path: Path) -> None:
     path = tmp_path / "one.dbc"
     text = f'{HEAD}BO_ 100 One: 8 A\n SG_ x : 0|8@1+ (1,0) [0|0] "°C" A\n'

@@ -83,6 +83,8 @@ def test_values_numbers_and_texts_of_a_signal() -> None:
     assert (TORQUE.shown(0), TORQUE.shown(0.5), TORQUE.shown(4095)) == ("off", "-4.995 N·m", "n/a")
     assert (OIL.value(-20), OIL.number(-20), OIL.shown(-20)) == (-10.0, 16364, "-10 degC")
     assert (COUNT.shown(7), COUNT.shown(3)) == ("7", "three")
+    assert (SPEED.shown(-1234.5678), SPEED.shown(1_234_567.8)) == ("-1234.57 rad/s", "1.23457e+06 rad/s")
+    assert replace(COUNT, choices={3: ""}).shown(3) == "", "a text that is empty is one"
     assert (replace(SPEED, unit="degC").number(20.0), SPEED.number(20.0)) == (293.15, 20.0)
 
 
@@ -127,6 +129,8 @@ def test_a_calibration_applies_factor_and_offset_in_the_unit() -> None:
 def test_facts_of_a_signal() -> None:
     assert facts(TORQUE) == {"low": -5.0, "high": 30.0, "period": 0.02, "factor": 0.01, "offset": -5.0, "raw": True,
                              "choices": {"0": "off", "4095": "n/a"}}  # fmt: skip
+    several = replace(COUNT, choices={10: "ten", 9: "nine", 100: "much"})
+    assert str(facts(several)["choices"]) == "{'9': 'nine', '10': 'ten', '100': 'much'}", "in the order of the numbers"
     assert facts(SPEED) == {"low": -1e30, "high": 1e30, "period": 0.001, "factor": 1.0, "offset": 0.0, "raw": False}
 
 
@@ -210,6 +214,8 @@ def test_teds_of_a_sensor_state_nothing_that_no_file_states() -> None:
     assert blocks[0, 130] == ORIGIN.encode()
     assert b"left gear" in blocks[0, 12]
     assert b"Gear" in WrappedSensor(ORIGIN, "Gear", (TORQUE,)).blocks(uuid)[0, 12]
+    several = WrappedSensor(ORIGIN, "Gear", (SPEED, TORQUE, COUNT, OIL)).blocks(uuid)
+    assert [channel for channel, code in sorted(several) if code == 5] == [2, 4]
 
 
 @pytest.mark.parametrize(("count", "good"), [(0, False), (1, True), (255, True), (256, False)])

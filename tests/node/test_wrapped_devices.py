@@ -115,6 +115,36 @@ def test_an_eds_gives_channels_with_range_factor_and_period() -> None:
     assert [(c.has_range, math.isfinite(c.uncertainty)) for c in sheet.channels] == [(True, False), (False, False)]
 
 
+def test_of_two_pdos_with_one_object_the_first_gives_its_period(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last of 512 PDOs and the last of its 64 places count too."""
+    stated = {
+        (0x1800, 5): 100, (0x1A00, 1): 0x20000110, (0x1A00, 2): 0x2001FF08,
+        (0x1801, 5): 20, (0x1A01, 1): 0x20000110, (0x1A01, 3): 0x20020008,
+        (0x1BFF, 64): 0x20030008, (0x1C00, 1): 0x20040008,
+    }  # fmt: skip
+    monkeypatch.setattr(canopen_device, "_default", lambda _, index, place: stated.get((index, place), 0))
+    objects: Any = {index for index, _ in stated}
+    assert canopen_device._sent_objects(objects) == {
+        (0x2000, 1): 0.1, (0x2001, 0xFF): 0.1, (0x2002, 0): 0.02, (0x2003, 0): 0.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("product", "title"),
+    [
+        (None, "left cell"),
+        ("", "left cell"),
+        ("  Torque\n cell ", "Torque cell"),
+        ("Cell " * 13, ("Cell " * 13).strip()),
+    ],
+)
+def test_a_device_has_the_name_of_its_product_or_that_of_its_file(product: str | None, title: str) -> None:
+    octets, objects = canopen_device.load(EDS)
+    objects.device_information.product_name = product
+    sensor = canopen_device.described(Path("left cell.eds"), octets, objects)
+    assert (sensor.title, sensor.origin.name) == (title, title[:60])
+
+
 @pytest.mark.link
 def test_pdos_are_mapped_as_the_device_says_and_the_rest_is_asked_for(bus: str, device: Device) -> None:
     messages: list[str] = []

@@ -19,7 +19,9 @@ from teds_provision.links.can.sensor_bus import SensorFrame
 from teds_provision.node.wrapped import canopen_device, dbc_message, description, iio_reader, wrapped_source
 from teds_provision.node.wrapped.can_reader import CanReader
 from teds_provision.node.wrapped.dbc_message import FrameKey
+from teds_provision.node.wrapped.iio_device import ScanElement
 from teds_provision.node.wrapped.iio_reader import IioReader
+from teds_provision.node.wrapped.latest_values import LatestValues
 from teds_provision.node.wrapped.wrapped_source import WrappedSource
 
 
@@ -159,6 +161,42 @@ def test_a_buffer_that_fails_is_given_up_and_one_that_ended_is_looked_at_again(m
     found, troubles, stop = _chunks(3, monkeypatch, b"", b"abcd", OSError(errno.EIO, "Input/output error"))
     assert (found, stop.waits) == ([b"abcd"], [0.2])
     assert troubles == ["the buffer has ended", "the buffer cannot be read: Input/output error"]
+
+
+def test_the_scans_of_a_buffer_are_a_period_apart_and_the_newest_is_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two elements of 16 and 32 bits: two octets lie between them."""
+    scans = [ScanElement(0, "le", False, 16, 16, 0), ScanElement(1, "le", False, 32, 32, 0)]
+    came: list[tuple[str, float, int]] = []
+    parts: list[Any] = [
+        (SimpleNamespace(scan=scan), SimpleNamespace(put=lambda at, raw, name=name: came.append((name, at, raw))))
+        for name, scan in zip("xz", scans, strict=True)
+    ]
+    sizes: list[int] = []
+
+    def chunks(size: int) -> list[bytes]:
+        sizes.append(size)
+        return [bytes.fromhex("0100 ffff 02000100 0300 ffff 04000000"), bytes.fromhex("0500 ffff 06000000")]
+
+    monkeypatch.setattr(iio_reader, "time", SimpleNamespace(monotonic=lambda: 8.0))
+    rig = SimpleNamespace(_parts=parts, _device=SimpleNamespace(period=0.25), _chunks=chunks)
+    IioReader._read_buffer(cast("Any", rig))
+    assert sizes == [8]
+    assert came == [
+        ("x", 7.75, 1), ("z", 7.75, 0x10002), ("x", 8.0, 3), ("z", 8.0, 4), ("x", 8.0, 5), ("z", 8.0, 6),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("period", "kept"), [(1.0, 4), (0.07, 5), (1 / 1024, 308), (1e-5, 4096)])
+def test_values_of_the_last_three_tenths_of_a_second_are_kept(period: float, kept: int) -> None:
+    channel = description.WrappedChannel("x", "V", bits=8, period=period)
+    assert LatestValues(channel)._arrivals.maxlen == kept
+
+
+def test_a_late_value_has_its_period_in_four_digits_and_what_troubles_the_device() -> None:
+    late = LatestValues(description.WrappedChannel("x", "V", bits=8, period=1 / 30), "PDO")
+    assert late._late() == "no PDO for 100 ms, 3 periods of 33.33 ms"
+    late._trouble = "it is off"
+    assert late._late() == "no PDO for 100 ms, 3 periods of 33.33 ms: it is off"
 
 
 # -- descriptions ------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from teds_provision.protocol.plant.roster import (
     RemovedMember,
     Roster,
     Share,
+    names_other_ca,
     open_roster,
     read_roster,
     seal_roster,
@@ -77,6 +78,16 @@ def test_a_roster_is_written_as_the_known_answers_have_it(name: str) -> None:
     read = open_roster(octets_of(name), KEYS["ca"].point)
     assert document.payload(read.unsigned()) == payload_of(octets_of(name))
     assert payload_of(seal_roster(read, KEYS["ca"])) == payload_of(octets_of(name))
+
+
+def test_blanks_around_a_roster_and_a_request_do_not_count() -> None:
+    octets, ca = octets_of("roster 1"), KEYS["ca"].point
+    spaced = b" " + octets + b"\r\n"
+    assert open_roster(spaced, ca) == open_roster(octets, ca)
+    assert [names_other_ca(each, ca) for each in (octets, spaced)] == [False, False]
+    assert [names_other_ca(each, KEYS["west"].point) for each in (octets, spaced)] == [True, True]
+    asked = octets_of("member-request")
+    assert document.open_request(b" " + asked + b"\r\n") == document.open_request(asked)
 
 
 def test_a_roster_is_written_in_the_order_of_the_contract() -> None:

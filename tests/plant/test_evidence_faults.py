@@ -103,6 +103,7 @@ BLOCKS = "the blocks of the facts are not those of the Security TEDS (field 108)
         (lambda: faults(facts=replace(FACTS, origin=ORIGIN_TEXT)),
          ["the origin of the facts is not that of the Origin TEDS (130)"]),
         (lambda: faults(shown=replace(SHOWN, signature=None)), ["the datasheet is not signed"]),
+        (lambda: faults(shown=replace(SHOWN, signature=None), datasheet=None), ["the datasheet is not signed"]),
         (lambda: faults(shown=replace(SHOWN, station_key_signature=certified(OFFICE, OTHER))),
          ["the station that signed the datasheet is not certified by this CA (field 104)"]),
         (lambda: faults(datasheet=False), ["field 100 does not verify: the datasheet was changed"]),
@@ -114,6 +115,20 @@ BLOCKS = "the blocks of the facts are not those of the Security TEDS (field 108)
 )  # fmt: skip
 def test_one_fault_is_one_sentence(found: Callable[[], list[str]], expected: list[str]) -> None:
     assert found() == expected
+
+
+def test_every_fault_of_a_datasheet_is_named_whatever_else_is_wrong() -> None:
+    shown = replace(SHOWN, station_key_signature=certified(OFFICE, OTHER))
+    facts = replace(FACTS, sequence=8, blocks=(), origin=ORIGIN_TEXT)
+    assert faults(replace(GOOD, node=OTHER.point), shown, facts=facts, node_key=False, datasheet=False) == [
+        "the Security TEDS names another node key (field 101)",
+        "field 102 does not sign this key for this UUID",
+        SEQUENCE,
+        BLOCKS,
+        "the origin of the facts is not that of the Origin TEDS (130)",
+        "the station that signed the datasheet is not certified by this CA (field 104)",
+        "field 100 does not verify: the datasheet was changed",
+    ]
 
 
 def test_the_origin_is_good_if_the_datasheet_lists_it() -> None:
@@ -186,6 +201,7 @@ def test_a_statement_is_whole_and_in_the_order_of_the_contract() -> None:
     assert codec.base64_of(whole["predicate"]["station"]["certificate"], "x") == certified(LINE)
     assert list(whole["predicate"]) == ["facts", "verdict", "finished", "operator", "node", "station"]
     assert "operator" not in sealed()["predicate"]
+    assert sealed(operator="")["predicate"]["operator"] == ""
     assert sealed(facts=BROKE)["predicate"]["verdict"] == "failed"
     named = replace(FACTS, certificates=((1, H),), origin=None, firmware=("app", "1.2.3+4", H, 1), heads=("0" * 16, 3))
     shown = sealed(facts=named)["predicate"]["facts"]
@@ -193,6 +209,14 @@ def test_a_statement_is_whole_and_in_the_order_of_the_contract() -> None:
         [[1, H]], None, ["app", "1.2.3+4", H, 1], ["0" * 16, 3]
     )  # fmt: skip
     assert sealed(facts=replace(FACTS, firmware=None))["predicate"]["facts"]["firmware"] is None
+
+
+def test_a_statement_has_no_spaces_and_its_text_is_utf_8() -> None:
+    claim = EvidenceClaim(UUID, SHOWN.encode(), FACTS)
+    octets = seal(LINE, certified(LINE), claim, nonce=bytes(16), proof=bytes(64), finished=AT, operator="J. Müller")
+    payload = codec.base64_of(json.loads(octets)["payload"], "payload")
+    assert f'"finished":"{AT}","operator":"J. Müller","node":{{'.encode() in payload
+    assert b'","payloadType":"' in octets
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,14 @@ def test_the_known_request_is_signed_by_its_board_for_its_line_alone() -> None:
     assert request.line == KEYS["west"].point
 
 
+def test_blanks_around_a_request_and_an_answer_do_not_count() -> None:
+    octets = octets_of("sign-request")
+    assert open_request(b" " + octets + b"\r\n", POINTS.get) == open_request(octets, POINTS.get)
+    members = {"format": "teds-signed/1", "of": H, "refused": "guard", "why": "no"}
+    answer = document.sign_document(members, KEYS["office"], document.SIGNED)
+    assert open_answer(b" " + answer + b"\r\n", POINTS.get) == open_answer(answer, POINTS.get)
+
+
 def changed(**changes: Any) -> bytes:
     node = {**GOOD["node"], **changes.pop("node", {})}
     members = {name: value for name, value in {**GOOD, "node": node, **changes}.items() if value is not Ellipsis}

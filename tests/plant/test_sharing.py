@@ -11,7 +11,7 @@ from typing import Any, Literal
 import pytest
 
 from teds_provision.protocol.keys import SoftwareKey
-from teds_provision.protocol.plant.merged_claims import MergedClaims
+from teds_provision.protocol.plant.merged_claims import MergedClaims, _holders
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share
 from teds_provision.protocol.plant.sharing import (
     Offer,
@@ -197,6 +197,11 @@ IN_CONFLICT = {"two keys": "north and west name two keys", "other pin": "the pin
         (partial(unpinned, pins={NORTH: PIN}), ACCEPTED),
         (partial(unpinned, pins={}), LATER),
         (partial(asked, sender=EAST, held={WEST: KEY, EAST: KEY}), NOT_MADE),
+        (partial(asked, TO_EAST, conflicts=IN_CONFLICT), "no share of the roster sends it here"),  # the first of two
+        (partial(asked, conflicts=IN_CONFLICT, pin=PIN2), DISPUTED),
+        (partial(asked, pin=PIN2, held={}), OTHER_NODE),
+        (partial(asked, IMU, held={WEST: OTHER}), LATER),
+        (partial(asked, IMU, sender=EAST, held={WEST: KEY, EAST: KEY}), NOT_MADE),
         (partial(asked, sender=EAST, held={WEST: KEY, EAST: KEY}, quiet={WEST}), ACCEPTED),
     ],
 )  # fmt: skip
@@ -204,6 +209,16 @@ def test_a_copy_is_accepted_only_by_a_share_from_the_maker_for_an_undisputed_nod
     answer: Callable[[], str], why: str
 ) -> None:
     assert answer() == why
+
+
+def test_who_holds_the_newest_epoch_works_with_nodes() -> None:
+    roles = ("keeper", "base", "line", "sign")
+    members = tuple(Member(name, POINTS[name], b"", frozenset({role})) for name, role in zip(ROLES, roles, strict=True))
+    known = replace(roster(), members=members)
+    held = {NORTH: (3, "a1"), SOUTH: (3, "b2"), WEST: (3, "a1"), EAST: (4, "c3")}
+    assert _holders(known, held) == (3, {"a1": (NORTH, WEST), "b2": (SOUTH,)})
+    assert _holders(known, {**held, WEST: (5, "a1")}) == (5, {"a1": (WEST,)})
+    assert _holders(known, {EAST: (4, "c3")}) == (None, {})
 
 
 # -- what is forgotten ---------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from teds_provision.protocol.handover.bundle import (
     TYPE,
     BundledNode,
     _NodeWriter,
+    check_rules,
     open_bundle,
     peek_bundle,
     seal_bundle,
@@ -152,6 +153,13 @@ def test_a_move_has_one_receiver():
     with pytest.raises(PolicyError, match="exactly one"):
         opened(sealed(members))
     assert opened(seal_bundle(bundle(mode="move"), SENDER, [RECEIVER.point])).bundle.mode == "move"
+
+
+@pytest.mark.parametrize("to", [(), (RECEIVER, THIRD)])
+def test_a_move_to_none_or_to_two_counts_its_receivers(to):
+    with pytest.raises(PolicyError) as no:
+        check_rules(bundle(to=to, mode="move"))
+    assert no.value.message == f"A move has exactly one receiver, this one {len(to)}."
 
 
 def test_a_station_signature_of_another_ca_is_refused():
@@ -419,6 +427,11 @@ LAST = 0xFFFFFFFF
         ({"nodes": (node(name="x" * 1025),)}, "out of its range"),
         ({"nodes": (node(groups=("a", "two\nlines")),)}, "out of its range"),
         ({"nodes": (node(profile="\x1b"),)}, "out of its range"),
+        ({"nodes": (node(), node(2, groups=("a\tb",)))}, "out of its range"),
+        ({"nodes": (node(), node(2, profile=None), node(3, profile=None, groups=()))}, None),
+        ({"nodes": (node(uuid=bytes(9)),)}, "out of its range"),
+        ({"nodes": (node(node_key=bytes(64)),)}, "out of its range"),
+        ({"nodes": (node(key=bytes(15)),)}, "out of its range"),
         ({"nodes": (node(), node())}, "names an UUID twice"),
     ],
 )

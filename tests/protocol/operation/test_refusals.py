@@ -147,6 +147,7 @@ def test_data_sets_in_the_order_of_section_2() -> None:
         [
             ("read of a channel that is not there", read_data_set(9), U.UNKNOWN_COMMAND),
             ("read of channel 0", read_data_set(0), U.UNKNOWN_COMMAND),
+            ("read of channel 257", R(257, 3, 1, bytes(4)), U.UNKNOWN_COMMAND),
             ("read with three octets", R(1, 3, 1, bytes(3)), U.BAD_FORM),
             ("read of one not claimed, offset 1", R(2, 3, 1, b"\0\0\0\1"), U.WRONG_STATE),
             ("read at offset 1 of a faulty one", R(5, 3, 1, b"\0\0\0\1"), U.OUT_OF_RANGE),
@@ -160,6 +161,8 @@ def test_data_sets_in_the_order_of_section_2() -> None:
             ("sample of one not claimed", sample_of(1, 2), U.WRONG_STATE),
             ("sample with a faulty one", sample_of(1, 5), U.FAULT),
             ("write to a channel that is not there", write_data_set(9, b""), U.UNKNOWN_COMMAND),
+            ("write to channel 0", R(0, 3, 2, bytes(4)), U.UNKNOWN_COMMAND),
+            ("write to channel 260", R(260, 3, 2, bytes(4) + GOOD_VALUE), U.UNKNOWN_COMMAND),
             ("write of another width", write_data_set(4, b"\0"), U.BAD_FORM),
             ("write of another width, not claimed", write_data_set(6, b"\0"), U.BAD_FORM),
             ("write to one not claimed", write_data_set(6, TOO_MUCH), U.WRONG_STATE),
@@ -206,6 +209,7 @@ def test_self_test_power_operation_clock_and_idle() -> None:
         bench,
         [
             ("self-test of a channel that is not there", run_self_test(9), U.UNKNOWN_COMMAND),
+            ("self-test of channel 257", R(257, 1, 5, b"\0"), U.UNKNOWN_COMMAND),
             ("self-test without argument", R(1, 1, 5), U.BAD_FORM),
             ("self-test 1 of one that another claims", R(2, 1, 5, b"\1"), U.OUT_OF_RANGE),
             ("self-test of one that another claims", run_self_test(2), U.BUSY),
@@ -216,6 +220,7 @@ def test_self_test_power_operation_clock_and_idle() -> None:
             ("clock with a payload", R(0, 128, 16, b"\0"), U.BAD_FORM),
             ("clock without a claim", CLOCK, None),
             ("idle of a channel that is not there", idle(9), U.UNKNOWN_COMMAND),
+            ("idle of channel 257", R(257, 4, 2), U.UNKNOWN_COMMAND),
             ("idle with a payload", R(1, 4, 2, b"\0"), U.BAD_FORM),
             ("idle where nothing was claimed", idle(1), None),
             ("idle of all", idle(), None),
