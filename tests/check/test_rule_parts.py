@@ -247,3 +247,21 @@ def test_a_node_whose_address_was_not_moved_is_not_moved_back(home: int, now: in
     with pytest.raises(NotApplicableError) as no:
         session_rules.address_back(probe)
     assert str(no.value) == "The rule address-moves moved no address."
+
+
+@pytest.mark.parametrize("own", [None, {(1, 3): b"teds"}])
+def test_a_board_gets_its_own_teds_back_if_it_was_lent_others(monkeypatch: pytest.MonkeyPatch, own: Any) -> None:
+    """Its channels are asked for again, and so is why none could be claimed."""
+    course: list[Any] = []
+    probe: Any = SimpleNamespace(
+        own_blocks=own, channels={1: (SENSOR, 2)}, no_channels="none", close=lambda: course.append("closed")
+    )
+
+    def commit(of: Any, blocks: Any, *, write: Any) -> None:
+        assert of is probe
+        course.append((blocks, write))
+
+    monkeypatch.setattr(measuring_rules, "commit_blocks", commit)
+    measuring_rules.restore(probe)
+    assert course == ([] if own is None else ["closed", (own, {}), "closed"])
+    assert (probe.own_blocks, probe.channels, probe.no_channels) == (None, {}, "")

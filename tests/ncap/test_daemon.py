@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -536,3 +537,49 @@ def test_a_part_that_changed_the_store_has_it_looked_at_again(bench: Bench, monk
     monkeypatch.setattr(bench.daemon.directory, "refresh", lambda: bench.selected.append("refreshed"))
     bench.daemon._store_changed()
     assert (bench.selected, bench.events) == (["refreshed"], [("store", "changed")])
+
+
+def test_a_virtual_transducer_is_removed_while_no_measurement_can_begin_with_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, course = bench.daemon, list[Any]()
+
+    @contextmanager
+    def lock(name: str) -> Iterator[None]:
+        course.append(("lock", name))
+        yield
+        course.append("open")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(daemon.station, "lock", lock)
+        patch.setattr(daemon.measuring, "measurement_of", lambda uuid: course.append(("measured?", uuid)))
+        patch.setattr(daemon.virtuals, "forget", lambda uuid: course.append(("forgotten", uuid)) or "it")
+        patch.setattr(daemon.virtuals, "end", lambda one: course.append(("ended", one)))
+        patch.setattr(daemon.directory, "refresh", lambda: course.append("read again"))
+        daemon.drop_virtual(NODE)
+    assert course == [
+        ("lock", "virtual"), ("measured?", NODE), ("forgotten", NODE), "open", ("ended", "it"), "read again",
+    ]  # fmt: skip
+    assert bench.events == [("node", "left")]
+
+
+def test_of_each_group_it_is_shown_whether_it_is_measured(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = bench.daemon
+    monkeypatch.setattr(daemon.measuring, "measured_as", lambda name: ["m1"] if name == "arm" else [])
+    daemon.make_group("arm", [NODE, OTHER])
+    daemon.make_group("base", [OTHER])
+    assert [(group["name"], group["uuids"], group["measuring"]) for group in daemon.groups()] == [
+        ("arm", [NODE, OTHER], True), ("base", [OTHER], False),
+    ]  # fmt: skip
+
+
+def test_a_virtual_transducer_that_was_made_is_started_and_shown(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, course = bench.daemon, list[Any]()
+    made = SimpleNamespace(uuid=NODE, as_json=lambda: {"uuid": NODE})
+    monkeypatch.setattr(daemon.virtuals, "make", lambda **asked: course.append(asked) or made)
+    monkeypatch.setattr(daemon.directory, "answering_on", lambda: {"can:x"})
+    monkeypatch.setattr(daemon, "_start_virtuals", lambda: course.append("started"))
+    monkeypatch.setattr(daemon.directory, "refresh", course.append)
+    asked = {"name": "hand", "source": "noise", "content": "<teds/>", "profile": "gripper", "new_uuid": True}
+    assert daemon.make_virtual(**asked) == {"uuid": NODE}  # type: ignore[arg-type]
+    assert course == [{**asked, "on_bus": {"can:x"}}, "started", [NODE]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -192,3 +193,40 @@ def test_the_sources_of_a_virtual_transducer(source: str, good: bool) -> None:
         return
     with pytest.raises(UsageError):
         virtual._check_source(source)
+
+
+def test_sensors_that_are_known_are_fed_and_actuators_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    def channel(number: int, kind: str | None, *, actuator: bool = False) -> Any:
+        return SimpleNamespace(number=number, kind=kind, actuator=actuator, unit=SimpleNamespace(text=f"unit {number}"))
+
+    channels = [channel(1, "actuator", actuator=True), channel(2, "sensor"), channel(3, None), channel(4, "event")]
+    monkeypatch.setattr(simulation, "FlashFile", lambda folder: SimpleNamespace(hardware=folder))
+    monkeypatch.setattr(simulation.Sheet, "from_blocks", lambda _blocks: SimpleNamespace(channels=channels))
+    monkeypatch.setattr(simulation, "Converter", lambda _sheet, channel: SimpleNamespace(place=channel.number))
+    found: list[Any] = [(each.place, each.unit) for each in simulation.fed_channels(Path("x"))]
+    assert found == [(2, "unit 2"), (4, "unit 4")]
+
+
+def test_a_folder_is_open_for_the_block_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed, close = list[int](), os.close
+
+    def noted(descriptor: int) -> None:
+        closed.append(descriptor)
+        close(descriptor)
+
+    monkeypatch.setattr(os, "close", noted)
+    given: list[int] = []
+
+    def fails() -> None:
+        with virtual.opened_folder(tmp_path) as folder:
+            given.append(folder)
+            assert os.listdir(folder) == []
+            assert folder not in closed
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fails()
+    assert given[0] in closed
+    (tmp_path / "file").write_text("")
+    with pytest.raises(NotADirectoryError), virtual.opened_folder(tmp_path / "file"):
+        pass

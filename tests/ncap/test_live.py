@@ -9,7 +9,8 @@ import socket
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -384,3 +385,36 @@ def test_an_event_is_a_line_of_the_service_and_a_message_of_each_client_by_its_r
     assert {name: own[name] for name in own if name != "why"} == {
         name: reader[name] for name in reader if name != "why"
     }
+
+
+def test_a_beat_gives_out_what_came_since_the_one_before_and_a_sign_of_life_now_and_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The share of points of a channel follows from the time; a failed beat counts, and nothing of it is kept."""
+    live, spans, kept, sent = Live(), list[float](), list[int](), list[tuple[int, str]]()
+    clock = SimpleNamespace(monotonic=count(100.0, 0.5).__next__, time=lambda: 7.25)
+
+    def gather(seconds: float) -> dict[str, Any]:
+        spans.append(seconds)
+        if len(spans) == 1:
+            live._channels["ab", 1] = object()  # type: ignore[assignment]
+            raise OverflowError("int too large to convert to float")
+        kept.append(len(live._channels))
+        if len(spans) == 9:
+            raise asyncio.CancelledError
+        return {}
+
+    def broadcast(text: str, for_readers: str) -> None:
+        assert text == for_readers
+        sent.append((len(spans), text))
+
+    monkeypatch.setattr("teds_provision.ncap.live.BEAT", 0.0)
+    monkeypatch.setattr("teds_provision.ncap.live._TOLD", 1.5)
+    monkeypatch.setattr("teds_provision.ncap.live.time", clock)
+    monkeypatch.setattr(live, "_gather", gather)
+    monkeypatch.setattr(live, "_broadcast", broadcast)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(live.run())
+    assert (spans, kept) == ([0.5] * 9, [0] * 8)
+    assert [beats for beats, _ in sent] == [3, 6]
+    assert json.loads(sent[0][1]) == {"type": "beat", "time": 7.25}

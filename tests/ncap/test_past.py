@@ -602,3 +602,12 @@ def test_a_channel_is_forgotten_an_hour_after_its_last_value_looked_at_each_minu
     past._run()
     assert seen == [0, 2, 1, 1, 1], "after 70 s: the first one is older than an hour"
     assert list(past._channels) == [("cd" * 10, 1)]
+
+
+def test_the_rate_counts_ten_whole_seconds_before_the_newest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time", lambda: NOW)
+    past = History()
+    ramp(past, NOW - 13, 3)
+    for second in range(10):
+        past.block(block(NOW - 10 + second, [[1.0]] * 5, rate=5.0, index=300 + 5 * second))
+    assert past.channel_history(NODE, 1)["rate"] == 14.5, "a hundred in the first of them and five in each of nine"

@@ -518,3 +518,17 @@ def test_what_a_run_waits_for_is_an_event(desk: Desk) -> None:
     run: Any = SimpleNamespace(uuid=NODE, steps=[])
     provisioning._RunReporter(run, live).notice(Notice("retry", "It is busy."))
     assert events == [{"event": "provision", "uuid": NODE, "state": "running", "text": "It is busy."}]
+
+
+def test_a_run_is_done_only_when_its_node_is_shown(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that sees the end may ask for the node at once."""
+    shown: list[tuple[Any, ...]] = []
+
+    def show(directory: Any, uuid: str, verified: Any) -> None:
+        shown.append((directory is desk.runs._directory, uuid, verified.verdict, desk.state(uuid)))
+
+    monkeypatch.setattr(provisioning, "_show_verified", show)
+    desk.runs.begin(NEXT, **ORDER)
+    assert desk.tap(OTHER)
+    until(lambda: desk.state(OTHER) == "done")
+    assert shown == [(True, OTHER, "authentic", "running")]

@@ -12,6 +12,7 @@ import pytest
 
 from teds_provision.errors import NotFoundError
 from teds_provision.ncap.live import Live, LiveClient
+from teds_provision.ncap.nodes import directory as of_nodes
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.shapes.node import KnownNode
 from tests.pace import PATIENCE
@@ -209,3 +210,76 @@ def test_a_live_channel_has_raw_numbers_apart_a_sign_of_life_and_for_readers_no_
             {"ab/1": [[1.0], [2.0]]}, {"cd/2": [[1.0], [7.0]]},
         )  # fmt: skip
         assert (found["event"]["event"], found["event"]["state"], found["event"]["name"]) == ("sink", "failed", name)
+
+
+def test_a_datasheet_is_decoded_once_for_each_that_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that was read just now goes before what is stored, until that is followed."""
+    images: list[bytes] = []
+    stored: list[Any] = [None, None]  # its digest, and the datasheet itself
+
+    def datasheet(uuid: bytes) -> Any:
+        images.append(uuid)
+        return stored[1]
+
+    nothing: Any = None
+    directory = NodeDirectory(nothing, nothing)
+    monkeypatch.setattr(directory, "_station", SimpleNamespace(datasheets=SimpleNamespace(datasheet=datasheet)))
+    monkeypatch.setattr(directory, "_stored", lambda _uuid: SimpleNamespace(teds_sha256=stored[0]))
+
+    def sheet_of(image: str) -> Any:
+        def shown_in(shown: Any) -> Any:
+            return SimpleNamespace(channels=[f"{image} in {shown[1]}"], meta=SimpleNamespace(name=f"own {image}"))
+
+        return SimpleNamespace(shown_in=shown_in)
+
+    monkeypatch.setattr(of_nodes, "Sheet", SimpleNamespace(from_image=sheet_of))
+    monkeypatch.setattr(
+        of_nodes, "shown_units", lambda _station, uuid: {1: "mm"} if uuid == bytes.fromhex(NODE) else {}
+    )
+    monkeypatch.setattr(of_nodes, "channel_facts", lambda channel: {"is": channel})
+    monkeypatch.setattr(of_nodes, "_origin", lambda sheet: sheet and {"of": sheet.meta.name})
+    for digest, image, shown, name in (
+        (None, None, [], ""),
+        ("d1", "x", ["x in mm"], "own x"),
+        ("d2", "y", ["y in mm"], "own y"),
+    ):
+        stored[:] = digest, image
+        before, changes = len(images), directory.changes
+        for _ in range(2):
+            assert NodeDirectory._sheet(directory, NODE) == [{"is": channel} for channel in shown]
+        assert (len(images) - before, directory.changes - changes) == (1, 1)
+        assert (directory._own_names[NODE], directory._origins[NODE]) == (name, {"of": name} if name else None)
+        assert directory._shown_in[NODE] == {1: "mm"}
+    directory._channels[NODE] = "read now", [{"is": "read"}]
+    assert directory._sheet(NODE) == [{"is": "read"}]
+    assert images == [bytes.fromhex(NODE)] * 3
+
+
+def test_the_event_of_a_node_has_its_problem_its_place_its_work_and_its_verdict_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    events: list[tuple[str, dict[str, Any]]] = []
+    nothing: Any = None
+    live: Any = SimpleNamespace(event=lambda kind, **facts: events.append((kind, facts)))
+    directory = NodeDirectory(nothing, live)
+    directory.note(
+        NODE, "came", place="can:x", present=True, seen=5.0, busy="it is looked at", problem=None, verdict="authentic"
+    )
+    directory.note(NODE, problem={"code": "link"})
+    directory.note(NODE, "verified", looked=1.0)
+    shown = {"place": "can:x", "busy": "it is looked at", "problem": None, "verdict": "authentic"}
+    assert events == [
+        ("node", {"uuid": NODE, "state": "came", **shown}),
+        ("node", {"uuid": NODE, "state": "verified"}),
+    ]
+    seen = directory.seen(NODE)
+    assert (seen.version, seen.problem, seen.looked, hasattr(seen, "verdict")) == (3, {"code": "link"}, 1.0, False)
+    monkeypatch.setattr(of_nodes, "MOST_GONE", 1)
+    kept, first, last = "01" * 10, "02" * 10, "03" * 10
+    directory._rows[kept] = KnownNode(kept)
+    for uuid in (kept, first, last):
+        directory.note(uuid, "came", present=True)
+    for uuid in (kept, first, last):
+        directory.note(uuid, present=False)
+    directory.note(last, "left")
+    assert sorted(directory._seen) == [kept, last, NODE], "one of the store and one that is there stay"

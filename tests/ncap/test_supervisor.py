@@ -18,6 +18,7 @@ from starlette.responses import StreamingResponse
 from teds_provision import client
 from teds_provision.errors import (
     FrozenError,
+    LinkError,
     NodeBusyError,
     NoNodeError,
     NotFoundError,
@@ -32,7 +33,7 @@ from teds_provision.measure.matching import NodeLoad, NodeMatch, UnsignedNodes
 from teds_provision.ncap import measurement_supervisor
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, NodeLoan
-from teds_provision.ncap.membership import Member, Membership
+from teds_provision.ncap.membership import AfterEnd, Member, Membership
 from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
@@ -1177,3 +1178,61 @@ def test_a_node_that_another_part_works_with_is_considered_again_a_tenth_of_a_se
     assert running.membership.elsewhere == set()
     assert service.locks.holder(NODE) == "it is looked at"
     running.phase = Phase.OVER
+
+
+def test_an_expression_of_the_start_is_measured_as_it_was_asked_for(service: Service) -> None:
+    """Frozen or not is another measurement; one of a group that does not exist is refused and begins nothing."""
+    service.measurements._dead_man = 250
+    made = service.measurements.add({"match": "all", "rate": 20.0})["id"]
+    for wrong, error in (("group:nobody", NotFoundError), ("colour:red", UsageError)):
+        with pytest.raises(error):
+            service.measurements.match(wrong)
+    assert [shown["id"] for shown in service.measurements.all()] == [made]
+    service.measurements.match("all", rate=20.0, frozen=True)
+    [begun] = [shown for shown in service.measurements.all() if shown["id"] == "run"]
+    assert {name: begun[name] for name in ("match", "rate", "frozen", "dead_man", "owner")} == {
+        "match": "all", "rate": 20.0, "frozen": True, "dead_man": 250, "owner": "ncap",
+    }  # fmt: skip
+    logged = [entry.outcome for entry in entries(service, "measure") if (entry.detail or {}).get("id") == "run"]
+    assert logged == ["begun"]
+
+
+def test_what_follows_for_a_node_that_ended_or_is_lost_is_done(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, course = open_to(service, monkeypatch), list[tuple[Any, ...]]()
+    workers = SimpleNamespace(
+        submit=lambda work, sighting: course.append((work.__name__, sighting)), shutdown=lambda **_how: None
+    )
+    monkeypatch.setattr(service.measurements, "_workers", workers)
+    monkeypatch.setattr(service.measurements, "_consider", lambda _running, uuid: course.append(("consider", uuid)))
+    done = threading.Event()
+    done.set()
+    last, error, decided = cast(Any, object()), LinkError("Silent."), list[tuple[Any, ...]]()
+    decisions = [AfterEnd.ASK, AfterEnd.TRY, AfterEnd.NOTHING, AfterEnd.ASK]
+
+    def end(uuid: str, now: float, error: Any, *, last: Any, seen: Any, room: float) -> AfterEnd:
+        assert uuid not in running.membership.members, "it is released before"
+        decided.append((uuid, now, error, last, seen is service.buses.presence.seen_at(b""), room))
+        return decisions.pop(0)
+
+    def release(of: Any, uuid: str) -> None:
+        assert of is running
+        del running.membership.members[uuid]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(service.measurements, "_release", release)
+        patch.setattr(running.membership, "end", end)
+        for place in (last, last, last, None):
+            supervisor: Any = SimpleNamespace(done=done, uuid=bytes.fromhex(NODE), error=error, sighting=place)
+            running.membership.members[NODE] = Member(supervisor=supervisor)
+            service.measurements._reap(running, cast(Any, SimpleNamespace(lent=set())), NODE, 7.0)
+    assert course == [("_ask", last), ("consider", NODE)], "one without a last place cannot be asked"
+    assert decided == [(NODE, 7.0, error, place, True, 0.5) for place in (last, last, last, None)]
+    course.clear()
+    running.membership.busy = {NODE: 5.0, OTHER: 5.5}
+    running.membership.lost = {OTHER: cast(Any, SimpleNamespace(sighting=last, since=0.0, at=5.0, pause=1.0))}
+    for node in (NODE, OTHER):
+        service.directory.note(node, present=True)
+    service.measurements._try_again(running, 5.0)
+    assert course == [("consider", NODE), ("_ask", last)]

@@ -684,3 +684,36 @@ def test_a_plan_that_loses_its_session_ends_with_the_cause(
     with pytest.raises(NoNodeError) as lost:
         made._planned(NODE, cast(Any, None))
     assert lost.value is cause
+
+
+def test_a_full_disk_at_the_end_of_an_update_hides_no_result_and_a_bug_is_in_the_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_words: Any, **_facts: Any) -> None:
+        raise StoreError("The disk is full.")
+
+    monkeypatch.setattr(bench.updates._station, "audit", full)
+    action, bug = bench.action(BoardRow(NODE, state="running")), ZeroDivisionError("bug")
+    done = [Finished(NODE, bug)]
+    bench.updates._follow(action, cast(Any, SimpleNamespace(results=lambda: iter(done))))
+    assert (action.state, action.rows[NODE].result) == ("done", "refused")
+    assert [facts["state"] for _, facts in bench.events] == ["running", "running", "done"]
+    [record] = [record for record in caplog.records if record.name == updates.__name__]
+    assert record.getMessage() == f"Updating node {NODE} failed."
+    assert record.exc_info is not None
+    assert record.exc_info[1] is bug
+
+
+def test_as_many_boards_are_planned_at_once_as_was_asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = SimpleNamespace(version_text="1.1.0", digest=b"d", board=None, octets=b"x", security_counter=None)
+    monkeypatch.setattr(updates, "_image_of", lambda _octets: image)
+    monkeypatch.setattr(bench.updates, "_planned", lambda _uuid, _order: PLAN)
+    asked, work_of = list[tuple[int, int]](), updates.ParallelWork
+
+    def work(items: Any, do: Any, *, at_once: int, name: str) -> Any:
+        asked.append((len(items), at_once))
+        return work_of(items, do, at_once=at_once, name=name)
+
+    monkeypatch.setattr(updates, "ParallelWork", work)
+    bench.updates.plan(b"x", UpdateRequest((NODE, OTHER, "ef" * 10), parallel=2), owner="page")
+    assert asked == [(3, 2)]

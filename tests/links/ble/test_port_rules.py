@@ -344,3 +344,37 @@ def test_a_node_that_is_known_no_more_has_no_link(port: MockPort) -> None:
 
 def test_transactions_are_of_16_bits(port: MockPort) -> None:
     assert [port.next_transaction() for _ in range(3)] == [0xFFFF, 0, 1]
+
+
+def test_who_listens_waits_for_the_first_message_and_takes_those_that_are_there_behind_it(
+    port: MockPort, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits, there = list[float](), ["a", "b", "c"]
+
+    def get(timeout: float) -> str:
+        waits.append(timeout)
+        return get_nowait()
+
+    def get_nowait() -> str:
+        if not there:
+            raise queue.Empty
+        return there.pop(0)
+
+    monkeypatch.setattr(port, "_data", SimpleNamespace(get=get, get_nowait=get_nowait))
+    found: list[Any] = [port.get_all(0.25), port.get_all(2.5)]
+    assert (found, waits) == ([["a", "b", "c"], []], [0.25, 2.5])
+
+
+def test_a_cache_that_could_not_be_written_is_written_the_next_time_for_this_user_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    folder.write_text("in its place")
+    known = RememberedNodes(folder / "nodes.json")
+    known.remember_node(ONE, who(ONE))
+    known.save()
+    folder.unlink()
+    known.save()
+    assert RememberedNodes(folder / "nodes.json").items() == [(ONE, who(ONE))]
+    assert folder.stat().st_mode & 0o077 == 0
+    (folder / "nodes.json").unlink()
+    known.save()
+    assert not (folder / "nodes.json").exists(), "nothing is new"

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from dbus_fast import BusType, Message, MessageType
+from dbus_fast.errors import DBusError
 
 from teds_provision.errors import NodeSilentError, NoReaderError, UsageError
 from teds_provision.links.ble import ble_errors, bluez
@@ -154,3 +158,87 @@ def test_an_adapter_holds_the_connections_of_its_own_devices(
         for name, (adapter, connected) in interfaces.items()
     }
     assert bluez._is_held(as_dbus, "/org/bluez/hci0") is held
+
+
+class MockMessageBus:
+    """A system bus whose bluetoothd answers each call, in turn, by what ``replies`` has."""
+
+    def __init__(self, *, bus_address: str | None, bus_type: Any) -> None:
+        self.opened = bus_address, bus_type
+        self.replies: list[Any] = []
+        self.calls: list[tuple[Any, ...]] = []
+        self.ended = 0
+
+    async def connect(self) -> MockMessageBus:
+        return self
+
+    def disconnect(self) -> None:
+        self.ended += 1
+
+    async def call(self, message: Message) -> Any:
+        self.calls.append(
+            (message.destination, message.path, message.interface, message.member, message.signature, message.body)
+        )
+        return self.replies.pop(0)
+
+
+def _answer(*body: Any) -> Any:
+    return SimpleNamespace(message_type=MessageType.METHOD_RETURN, body=body)
+
+
+@pytest.fixture
+def system_bus(monkeypatch: pytest.MonkeyPatch) -> MockMessageBus:
+    bus = MockMessageBus(bus_address=None, bus_type=None)
+
+    def opened(*, bus_address: str | None, bus_type: Any) -> MockMessageBus:
+        bus.opened = bus_address, bus_type
+        return bus
+
+    monkeypatch.setattr("dbus_fast.aio.MessageBus", opened)
+    return bus
+
+
+def test_each_adapter_is_listed_by_name_with_what_it_can_and_how_many_connections_it_holds(
+    system_bus: MockMessageBus,
+) -> None:
+    """An old bluetoothd states no roles: its adapters connect to nodes."""
+
+    def facts(**values: Any) -> dict[str, Any]:
+        return {name: SimpleNamespace(value=value) for name, value in values.items()}
+
+    device = {"org.bluez.Device1": facts(Adapter="/org/bluez/hci1", Connected=True)}
+    objects = {
+        "/org/bluez/hci1": {"org.bluez.Adapter1": facts(Address="F0:00:00:00:00:01", Powered=False)},
+        "/org/bluez": {"org.bluez.AgentManager1": {}},
+        "/org/bluez/hci1/dev_1": device,
+        "/org/bluez/hci1/dev_2": device,
+        "/org/bluez/hci0": {
+            "org.bluez.Adapter1": facts(Address="F0:00:00:00:00:00", Powered=True, Roles=["peripheral"])
+        },
+    }
+    system_bus.replies = [_answer(True), _answer(objects)]
+    assert asyncio.run(bluez._adapters("unix:path=/bus")) == [
+        bluez.AdapterFacts("hci0", "F0:00:00:00:00:00", True, False, 0),
+        bluez.AdapterFacts("hci1", "F0:00:00:00:00:01", False, True, 2),
+    ]
+    bus, manager = "org.freedesktop.DBus", "org.freedesktop.DBus.ObjectManager"
+    assert system_bus.calls == [
+        (bus, "/org/freedesktop/DBus", bus, "NameHasOwner", "s", ["org.bluez"]),
+        ("org.bluez", "/", manager, "GetManagedObjects", "", []),
+    ]
+    assert (system_bus.opened, system_bus.ended) == (("unix:path=/bus", BusType.SYSTEM), 1)
+
+
+def test_a_bluetoothd_that_does_not_run_or_refuses_is_named_and_its_bus_closed(system_bus: MockMessageBus) -> None:
+    system_bus.replies = [_answer(False)]
+    with pytest.raises(NoReaderError) as absent:
+        asyncio.run(bluez._adapters(None))
+    assert absent.value.message == "The Bluetooth service (bluetoothd) is not running."
+    assert absent.value.hint == ble_errors.SERVICE_HINT
+    name = "org.freedesktop.DBus.Error.AccessDenied"
+    refusal = SimpleNamespace(message_type=MessageType.ERROR, error_name=name, body=["Not for you"])
+    system_bus.replies = [_answer(True), refusal]
+    with pytest.raises(DBusError) as refused:
+        asyncio.run(bluez._adapters(None))
+    assert (refused.value.type, refused.value.text) == (name, "['Not for you']")
+    assert system_bus.ended == 2

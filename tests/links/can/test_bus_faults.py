@@ -6,6 +6,7 @@ The interface is a mock: no test machine has one that fails in each of these way
 from __future__ import annotations
 
 import errno
+import logging
 import socket
 import threading
 from types import SimpleNamespace
@@ -378,3 +379,55 @@ def test_what_the_fast_path_hears_is_a_frame_nothing_or_the_end_of_the_bus(monke
         "The CAN controller of virtual:faulty went bus-off: too many frame errors.",
         "The CAN bus virtual:faulty cannot be read: [Errno 100] Network is down.",
     ]
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_of_multicast_one_group_is_heard_and_the_kernel_keeps_more_than_256_frames(
+    monkeypatch: pytest.MonkeyPatch, refused: bool
+) -> None:
+    """Sixty nodes answer one question with 300; a kernel that does not allow more is no failure."""
+    asked: list[tuple[Any, ...]] = []
+
+    class Socket(socket.socket):
+        def setsockopt(self, *words: Any) -> None:
+            asked.append(words)
+            if refused and words[1] == socket.SO_RCVBUF:
+                raise PermissionError(errno.EPERM, "not permitted")
+
+    interface: Any = Interface()
+    with Socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
+        interface._multicast = SimpleNamespace(_socket=own)
+        monkeypatch.setattr(can, "Bus", lambda **_options: interface)
+        assert bus_module.open_bus(parse_spec("udp_multicast:239.74.163.2")) is interface
+        assert bus_module.open_bus(parse_spec("virtual:a")) is interface
+    assert asked == [(socket.IPPROTO_IP, 49, 0), (socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)]
+    assert interface.filters is None
+
+
+def test_the_libraries_of_can_write_no_lines_of_their_own_and_filters_are_whole(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("can", "isotp"):
+        caplog.set_level(logging.WARNING, logger=name)
+    interface: Any = Interface()
+    monkeypatch.setattr(can, "Bus", lambda **_options: interface)
+    spec = parse_spec("socketcan:can0")
+    bus_module.open_bus(spec)
+    assert interface.filters is None, "all that is on the bus"
+    bus_module.open_bus(spec, [(0x18DA00F1, 0x1FFF00FF), (0x1CFF0000, 0x1FFF0000)])
+    assert interface.filters == [
+        {"can_id": 0x18DA00F1, "can_mask": 0x1FFF00FF, "extended": True},
+        {"can_id": 0x1CFF0000, "can_mask": 0x1FFF0000, "extended": True},
+    ]
+    assert [logging.getLogger(name).level for name in ("can", "isotp")] == [logging.CRITICAL] * 2
+
+
+def test_an_interface_whose_driver_is_missing_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**_options: Any) -> None:
+        raise can.CanInterfaceNotImplementedError("no library")
+
+    monkeypatch.setattr(can, "Bus", fail)
+    with pytest.raises(NoReaderError) as no:
+        Bus(parse_spec("kvaser:0"))
+    assert no.value.message == "Cannot use CAN interface 'kvaser' here: no library."
+    assert no.value.hint == "It needs Kvaser's CANlib (linuxcan, from kvaser.com)."

@@ -150,3 +150,12 @@ def test_a_key_that_the_interface_does_not_have_is_refused_with_those_that_it_ha
 def test_an_interface_whose_keys_are_not_known_takes_any() -> None:
     parse_spec("made_by_us:0?speed=3").require_known()
     parse_spec("socketcan:can0").require_known()
+
+
+@pytest.mark.parametrize(
+    ("query", "example"), [("node=240", "node=0x1"), ("source=0xF8", "source=0xf1"), ("bitrate=0", "bitrate=0x1")]
+)
+def test_a_number_that_cannot_be_meant_is_answered_by_one_that_can(query: str, example: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        parse_spec(f"socketcan:can0?{query}")
+    assert refused.value.hint == f"Write, for example, {example}."

@@ -284,3 +284,32 @@ def test_a_silent_node_may_be_due_to_another_station_of_our_address_unless_the_b
         bus.exchange(SHORT)
     assert silent.value.message.endswith(" Another station uses 0xF1.") is named
     assert (silent.value.hint == "Use another.") is named
+
+
+@pytest.mark.parametrize(
+    ("clash", "listed", "torn", "error", "message", "hint"),
+    [
+        (False, False, False, NodeSilentError, "The node at 0x05 on virtual:a no longer answers.",
+         "Check its power, its wiring and its address."),
+        (False, False, True, GarbledError,
+         "The node at 0x05 on virtual:a answers, but frames of its replies are missing.",
+         "Check wiring, bit rate, bus load."),
+        (True, False, True, None, "", ""),
+        (False, True, True, None, "", ""),
+    ],
+)  # fmt: skip
+def test_why_an_exchange_failed_is_named_with_its_remedy(
+    clash: bool, listed: bool, torn: bool, error: type[Exception] | None, message: str, hint: str
+) -> None:
+    """Two nodes under one address tear each other's replies: that is the cause, whatever was torn."""
+    exchange: Any = link_module._Exchange.__new__(link_module._Exchange)
+    exchange._line = SimpleNamespace(node=5)
+    spec = SimpleNamespace(text="virtual:a")
+    exchange._bus = SimpleNamespace(spec=spec, has_conflict=lambda node: listed and node == 5)
+    exchange._clash, exchange._torn = clash, torn
+    failure = exchange._failed()
+    if error is None:
+        due = link_module.conflict(5)
+        assert (type(failure), failure.message) == (type(due), due.message)
+    else:
+        assert (type(failure), failure.message, failure.hint) == (error, message, hint)

@@ -10,8 +10,10 @@ import nfc.tag
 import pytest
 
 from teds_provision.errors import GarbledError
+from teds_provision.links.nfc import tag as of_tag
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
 from teds_provision.links.nfc.tag import (
+    FieldLostError,
     NfcpyType4Ndef,
     ReaderTag,
     Type4Ndef,
@@ -226,3 +228,45 @@ def test_a_command_has_so_long_as_the_whole_of_its_answer(monkeypatch: pytest.Mo
     with pytest.raises(Type4TagCommandError):
         front.exchange(b"\x02", 9.0)
     assert len(air.sent) == 3
+
+
+@pytest.mark.parametrize(("announced", "used"), [(0, 1), (1, 1), (255, 255), (256, 255)])
+def test_a_type_4_tag_is_read_and_written_by_one_to_255_octets(
+    announced: int, used: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ndef: Any = Type4Ndef.__new__(Type4Ndef)
+    outcomes = [True, False]
+
+    def discover(found: Any) -> bool:
+        found._max_le, found._max_lc = announced, announced + 1
+        return outcomes.pop(0)
+
+    monkeypatch.setattr(NfcpyType4Ndef, "_discover_ndef", discover)
+    assert ndef._discover_ndef() is True
+    assert (ndef._max_le, ndef._max_lc) == (used, min(announced + 1, 255))
+    assert ndef._discover_ndef() is False
+
+
+@pytest.mark.parametrize(("reads", "present"), [(1, True), (3, True), (4, True), (4, False)])
+def test_a_message_is_read_three_times_at_most_while_its_tag_is_there(
+    reads: int, present: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried, pauses = list[int](), list[float]()
+
+    class OneTag(ReaderTag):
+        is_present = present
+
+        def _read_once(self) -> bytes | None:
+            tried.append(len(tried))
+            return b"message" if len(tried) == reads else None
+
+    monkeypatch.setattr(of_tag, "time", SimpleNamespace(sleep=pauses.append))
+    tag = OneTag(SimpleNamespace(identifier=b"id"), "Type 4")
+    if reads <= 3:
+        assert tag.read() == b"message"
+    else:
+        with pytest.raises(GarbledError if present else FieldLostError) as failure:
+            tag.read()
+        assert not present or failure.value.message == "The tag has no readable NDEF message."
+    assert len(tried) == (min(reads, 3) if present else 1)
+    assert pauses == [0.02] * (len(tried) - 1)

@@ -156,3 +156,23 @@ def test_read_and_write_of_a_type_2_tag_are_pseudo_apdus() -> None:
         "ffb0000410",
         "ffd600050461626364",
     ]
+
+
+@pytest.mark.parametrize(
+    ("atr", "answer", "kind", "uid"),
+    [
+        ("3b8080 0101", b"\4\1\2\3\x90\0", "Type 4", b"\4\1\2\3"),
+        ("3b8f8001804f0ca000000306030003", b"\4\1\2\3\4\5\6\x90\0", "Type 2", b"\4\1\2\3\4\5\6"),
+        ("3b8f8001804f0ca000000306030003", b"\4\1\x63\0", "Type 2", b""),
+    ],
+)
+def test_a_card_without_a_processor_is_a_type_2_tag_and_has_its_uid_if_it_gives_one(
+    opened: Callable[[Library], PcscReader], atr: str, answer: bytes, kind: str, uid: bytes
+) -> None:
+    reader = opened(Library(atr=[bytes.fromhex(atr)], transmit=[answer]))
+    tag = reader.sense()
+    assert tag is not None
+    assert (tag.kind, tag.uid) == (kind, uid)
+    assert reader._card is not None
+    assert reader._card.target is not None
+    assert reader._card.target.uid == uid

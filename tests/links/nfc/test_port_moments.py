@@ -378,3 +378,19 @@ def test_a_node_is_known_by_its_service_and_its_id_record() -> None:
     assert isinstance(seen, NodeInField)
     assert seen.identity.uuid == WANTED
     assert (seen.service.n_wait, seen.charging, seen.ble) == (15, None, None)
+
+
+@pytest.mark.parametrize(
+    ("sees", "remedy"),
+    [
+        (None, "Place the node's NFC antenna flat on the reader, or allow more time with --timeout."),
+        (at_reader(OTHER), "Place the requested node on the reader, or name the one that is on it."),
+    ],
+)
+def test_each_reason_why_a_node_did_not_come_has_its_remedy(
+    scene: Scene, sees: NodeInField | None, remedy: str
+) -> None:
+    scene.sees = [sees]
+    with pytest.raises(NoNodeError) as failure:
+        scene.port.find(is_wanted, seconds=2, notice=scene.note)
+    assert failure.value.hint == remedy

@@ -236,3 +236,17 @@ def test_loading_nfcpy_leaves_the_search_for_libraries_as_it_was(monkeypatch: py
     with pytest.raises(ImportError):
         nfcpy._load()
     assert ctypes.util.find_library is find
+
+
+def test_only_what_nfcpy_has_a_driver_for_is_a_reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[Any] = [[(*ACR, 1, 5), (0x1D6B, 0x0002, 1, 1), (0x054C, 0x06C3, 2, 7)], None]
+    asked: list[str] = []
+
+    def find(path: str) -> Any:
+        asked.append(path)
+        return found.pop(0)
+
+    monkeypatch.setattr(nfc.clf.transport.USB, "find", find)
+    assert reader._usb_readers("usb") == [(*ACR, 1, 5), (0x054C, 0x06C3, 2, 7)]
+    assert reader._usb_readers("usb:001") == []
+    assert asked == ["usb", "usb:001"]
