@@ -200,7 +200,9 @@ def _has(term: Term, channel: Channel) -> float:
             return 1 / channel.period if channel.period > 0 else math.nan
         case "uncertainty":
             stated = channel.stated_uncertainty
-            return stated / width if _relative(term) and width > 0 else stated
+            if not _relative(term):
+                return stated
+            return stated / width if 0 < width < math.inf else math.nan
         case "range":
             return width
         case "low":

@@ -76,3 +76,12 @@ def names_of(node: ast.AST) -> set[str]:
         own = [line.target for line in node.body if isinstance(line, ast.AnnAssign)]
         return {ast.unparse(target) for target in own} if node.name != "Failure" else set()
     return set()
+
+
+def test_what_an_error_lacks_is_filled_in_member_by_member() -> None:
+    for given, whole in (
+        ({"code": "busy"}, {"code": "busy", "message": "No answer.", "hint": ""}),
+        ({"message": "It is busy."}, {"code": "failed", "message": "It is busy.", "hint": ""}),
+        ({"hint": "Wait.", "more": 1}, {"code": "failed", "message": "No answer.", "hint": "Wait."}),
+    ):
+        assert problem_in({"error": given}, otherwise="No answer.") == whole

@@ -65,6 +65,13 @@ WORDS = [
     ((PAGES, "signature"), "not authentic"),
     ((SESSION, "sequence"), "not authentic"),
     ((SESSION, "key epoch"), "not authentic"),
+    (("signed",), "unsigned"),
+    ((SESSION,), "unproven"),
+    ((SESSION, "signed"), "unproven"),
+    ((PAGES,), "unproven"),
+    ((PAGES, "sequence"), "not authentic"),
+    ((SESSION, PAGES, "sequence"), "not authentic"),
+    (("sequence",), "not authentic"),
 ]
 
 
@@ -72,6 +79,8 @@ WORDS = [
 def test_one_word_sums_up_all_checks(failed: tuple[str, ...], word: str) -> None:
     checks = (PASSED, *(Check(name, "failed", "it is so") for name in failed))
     assert replace(VERDICT.verified, checks=checks).verdict == word
+    skipped = tuple(check._replace(result="skipped") for check in checks)
+    assert replace(VERDICT.verified, checks=skipped).verdict == "authentic", "what was not tried did not fail"
 
 
 def test_the_description_names_the_words_that_are_given_and_no_other() -> None:

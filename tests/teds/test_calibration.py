@@ -33,6 +33,7 @@ from teds_provision.teds.calibration import (
     residuals,
     sentence,
 )
+from teds_provision.teds.calibration import formula as formulas
 from teds_provision.teds.calibration.formula import kind_of
 from teds_provision.teds.profile import Profile, load_profile
 from teds_provision.teds.sheet import Sheet
@@ -755,3 +756,36 @@ def test_outside_is_beyond_either_end_of_any_input_and_what_is_no_number() -> No
         (0, 5, 0), (10, 6, 0), (-0.1, 5, 1), (10.1, 5, 1), (5, 4.9, 1), (5, 6.1, 1), (math.nan, 5, 1), (5, math.nan, 1),
     ):  # fmt: skip
         assert evaluate(both, one, other).outside == outside, (one, other)
+
+
+def test_a_table_has_as_many_nodes_as_a_teds_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formulas, "MAXIMUM_NODES", 3)
+    assert fit(POLYGON[:3], "table", channel=1).inputs[0].boundaries == (0.0, 1.0, 2.0)
+    with pytest.raises(BadDataError, match=r"^A table of 4 nodes is too large for a TEDS, which holds 3 at most\.$"):
+        fit(POLYGON[:4], "table", channel=1)
+
+
+def test_warnings_about_the_age_of_a_calibration_in_whole_words() -> None:
+    now, day = datetime(2026, 11, 21, tzinfo=UTC), 86400.0
+    assert SPLINE.date_warnings(now) == ["the calibration has no date."]
+    assert SPLINE.date_warnings(now, 30.4 * day) == [
+        "the calibration has no date, and is to be repeated every 30 days."
+    ]
+    ahead = replace(SPLINE, date=datetime(2026, 12, 1, tzinfo=UTC))
+    assert ahead.date_warnings(now) == ["the calibration date 2026-12-01 lies in the future."]
+    late = replace(SPLINE, date=datetime(2025, 11, 20, tzinfo=UTC), interval=365 * day)
+    assert late.date_warnings(now, 30 * day) == [
+        "the calibration of 2025-11-20 was due again on 2026-11-20, 1 day ago.",
+        "its interval of 365 days is longer than the 30 days that its type asks for.",
+    ]
+    for days, warned in ((365.3, False), (365.4, True)):
+        longer = replace(SPLINE, date=now, interval=days * day).date_warnings(now, 365 * day)
+        assert bool(longer) is warned, "more than a thousandth"
+
+
+def test_without_its_channel_a_calibration_is_that_of_its_first_input() -> None:
+    parts = (CalibrationInput(3, 1, (0, 200), (50,)), CalibrationInput(2, 1, (0, 40), (25,)))
+    decoded = teds.decode(teds.compose(5, replace(TWO_INPUTS, inputs=parts).fields()))
+    assert from_decoded(decoded).channel == 3
+    assert from_decoded(decoded, channel=7).channel == 7
+    assert [part.channel for part in from_decoded(decoded, channel=7).inputs] == [3, 2]

@@ -158,6 +158,7 @@ def test_a_file_that_is_no_table_of_points_is_answered_with_how_one_looks(text: 
         ),
         ("slope = 1\ndegree = 1.5\n", "c.toml", "c.toml:2: degree: a whole number from 0 to 255 is expected, not 1.5."),
         ("slope = 1\ndegree = 256\n", "c.toml", "c.toml:2: degree: a whole number from 0 to 255 is expected, not 256."),
+        ("slope = 1\ndegree = -1\n", "c.toml", "c.toml:2: degree: a whole number from 0 to 255 is expected, not -1."),
         (
             "slope = 1\nmethod = 'steps2'\n",
             "c.toml",

@@ -19,7 +19,7 @@ from teds_provision.teds.dcc.shown import ShownCertificate, points_of
 from teds_provision.teds.dcc.si_units import parse_si_unit, write_si_unit
 from teds_provision.teds.dcc.write import Laboratory, QuantityCondition, read_laboratory, write_certificate
 from teds_provision.teds.profile import Profile, load_profile
-from teds_provision.teds.units import parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_unit
 
 from .certificates import ANGLE, changed
 
@@ -123,6 +123,7 @@ def test_every_unit_of_the_d_si(text: str, unit: str, scale: float) -> None:
         ("m/s²", (r"\metre\second\tothe{-2}", 1.0, 0.0)),
         ("deg/s", (r"\radian\second\tothe{-1}", 0.017453292519943295, 0.0)),
         ("count", (r"\one", 1.0, 0.0)),
+        ("K**0.5", (r"\kelvin\tothe{0.5}", 1.0, 0.0)),
     ],
 )
 def test_how_a_unit_is_written(unit: str, written: tuple[str, float, float]) -> None:
@@ -277,6 +278,7 @@ def test_a_table_has_an_id_of_its_own_or_its_number_and_no_id_appears_twice() ->
         ("%", "", {}, {"DatModel": 1, "ModLenth": 4, "SigBits": 32}, [(10, 100), (20, 200)]),
         ("%", "", {}, {"DatModel": 2, "ModLenth": 8, "SigBits": 64}, [(10, 100), (20, 200)]),
         ("%", "", {"indication": (10.0, 0.0)}, None, [(100, 100), (200, 200)]),
+        ("%", "rawValue", {"indication": (10.0, 0.0)}, None, [(10, 100), (20, 200)]),
         ("%", "", {}, None, None),
         ("count", "rawValue", {}, None, [(10, 1), (20, 2)]),
         ("count", "", {"indication": (0.5, 1.0)}, None, [(18, 1), (38, 2)]),
@@ -463,6 +465,10 @@ def test_rows_are_a_table_if_they_are_alike() -> None:
     [
         ("<dcc:list ", "<dcc:list refType='basic_beforeAdjustment' ", "as found"),
         ("<dcc:list ", "<dcc:list refType='x y_afterAdjustment' ", "as left"),
+        ("<dcc:list ", "<dcc:list refType='my_lab_afterAdjustment' ", "as left"),
+        ("<dcc:list ", "<dcc:list refType='beforeRepair' ", "before repair"),
+        ("<dcc:list ", "<dcc:list refType='a_afterAdjustment b_beforeAdjustment' ", "as found"),
+        ("<dcc:result>", "<dcc:result refType='a_afterRepair'><dcc:status>other</dcc:status>", "after repair"),
         ("<dcc:result>", "<dcc:result refType='basic_beforeRepair'>", "before repair"),
         ("<dcc:result>", "<dcc:result refType='basic_afterRepair'>", "after repair"),
         ("<dcc:result>", "<dcc:result><dcc:status>beforeAdjustment</dcc:status>", "as found"),
@@ -819,3 +825,36 @@ def test_tables_of_a_certificate_are_read_in_their_order() -> None:
         table(listed("", "1 2"), name="b") + table(listed("", "3 4"), name="a")
     ).tables
     assert [(part.id, part.quantities[0].values) for part in found] == [("b", (1.0, 2.0)), ("a", (3.0, 4.0))]
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(0.001, 273.15), (1.0, 100.0), (1.0, -273.15)])
+def test_only_degrees_celsius_have_a_name_with_a_zero_of_their_own(scale: float, offset: float) -> None:
+    unit = WrittenUnit("odd", parse_unit("K").units, scale, offset)
+    assert write_si_unit(unit) == (r"\kelvin", scale, offset)
+
+
+def test_of_what_is_no_unit_sixty_characters_are_shown() -> None:
+    with pytest.raises(BadDataError) as refused:
+        parse_si_unit("x" * 61)
+    assert refused.value.message == f'"{"x" * 60}" is not a unit of the D-SI.'
+
+
+def test_a_result_without_a_list_has_its_own_id_and_state() -> None:
+    inside = of(single("slope", "2") + single("intercept", "1")).decode()
+    for attributes, status, known in (
+        (" id='r' refType='x_afterRepair'", "", ("r", "after repair")),
+        (" id='r'", "<dcc:status>afterAdjustment</dcc:status>", ("r", "as left")),
+    ):
+        octets = changed(inside.encode(), ("<dcc:result>", f"<dcc:result{attributes}>{status}"))
+        (found,) = read_certificate(octets, "c").tables
+        assert (found.id, found.state) == known
+
+
+def test_a_table_of_an_influence_condition_is_read_before_those_of_the_results() -> None:
+    """What was found before an adjustment may stand there; a single number there is a condition and no table."""
+    before = table(listed("", "1 2"), listed("", "3 4"), name="found")
+    at = TEXT.index("<dcc:data>", TEXT.index("<dcc:influenceCondition")) + len("<dcc:data>")
+    octets = (TEXT[:at] + before + TEXT[at:]).encode()
+    stated = changed(octets, ("<dcc:influenceCondition>", "<dcc:influenceCondition refType='x_beforeAdjustment'>"))
+    tables = read_certificate(stated, "c").tables
+    assert [(part.id, part.state) for part in tables] == [("found", "as found"), ("channel-1", "")]

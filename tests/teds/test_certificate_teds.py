@@ -124,3 +124,9 @@ def test_what_a_line_can_hold(value: str, good: bool) -> None:
         return
     with pytest.raises(BadDataError):
         compose_lines(131, {"": value})
+
+
+def test_a_laboratory_that_is_cut_behind_a_blank_ends_with_its_last_word() -> None:
+    for name, kept in ((f"{'a' * 137} {'b' * 99}", "a" * 137), (f"{'a' * 136} {'b' * 99}", f"{'a' * 136} b")):
+        long = CertificateReference("1", name, "2026-10-12", "ab" * 32)
+        assert read_certificate_reference(long.encode()).laboratory == f"{kept}…"

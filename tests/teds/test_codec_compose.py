@@ -270,3 +270,10 @@ def test_numpy_numbers_are_numbers() -> None:
     assert teds.compose(1, fields) == octets_of("x07_meta")
     with pytest.raises(BadDataError, match="MaxChan"):
         teds.compose(1, {**META, "MaxChan": numpy.float64(2)})
+
+
+@pytest.mark.parametrize(("value", "shown"), [("12", "'12'"), (b"12", "b'12'"), (5, "5")])
+def test_a_pair_is_a_list_of_numbers_and_no_text(value: object, shown: str) -> None:
+    with pytest.raises(BadDataError) as refused:
+        teds.compose(3, {**KELVIN, "DAngles": value})
+    assert refused.value.message == f"DAngles is a list of numbers, not {shown}."

@@ -394,3 +394,11 @@ def test_beyond_the_most_findings_only_what_decides_the_verdict_is_noted(monkeyp
     mixed = teds.decode(misplaced + bytes.fromhex("2800") * 3 + bytes.fromhex("9600") * 5)
     assert [f.severity == "error" for f in mixed.findings].count(False) == 2, "however many errors are left out"
     assert "not-closed" in {f.code for f in teds.decode(misplaced + b"\x28\x09").findings}
+
+
+def test_fields_are_the_manufacturers_from_128_on_and_never_in_a_security_teds() -> None:
+    for kind, code in ((127, "unknown"), (128, "manufacturer"), (255, "manufacturer")):
+        found = codes(block(1, raw_tuple(kind, b"\1")))
+        assert {"unknown", "manufacturer"} & set(found) == {code}, kind
+    found = codes(block(128, raw_tuple(200, b"\1")))
+    assert ("manufacturer" in found, found["unknown"]) == (False, "note")

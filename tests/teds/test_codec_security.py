@@ -238,3 +238,13 @@ def test_signed_blocks_ascend_and_none_is_there_twice(places: str, good: bool) -
         return
     with pytest.raises(security.NotCanonicalError, match="The SignedBlocks do not ascend by channel and access code"):
         security.decode_block(changed)
+
+
+@pytest.mark.parametrize(
+    ("rest", "kind"),
+    [("0102 00", 1), ("010104 0205 00", 2), ("010104 020104 0302", 3), ("010104 02", 2), ("01", 1)],
+)
+def test_the_tuple_that_runs_past_the_end_is_named(rest: str, kind: int) -> None:
+    """A type alone, without its length, is one too."""
+    with pytest.raises(BadDataError, match=rf"^The tuple of type {kind} runs past the end of the data block\.$"):
+        security.decode_block(security.TEDSID_TUPLE + bytes.fromhex(rest))

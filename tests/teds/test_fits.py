@@ -373,3 +373,12 @@ def test_a_table_of_requirements_in_its_defaults() -> None:
     ]
     with pytest.raises(BadDataError, match=r"^task\.toml: \[Joint 3\]: there is no bound \"force\"\.$"):
         parse_require('["Joint 3"]\nforce = "1 N"\n', "task.toml")
+
+
+@pytest.mark.parametrize("ends", [(math.nan, 1.0), (0.0, math.nan), (1.0, 1.0), (2.0, 1.0), (-math.inf, math.inf)])
+def test_a_share_of_a_range_that_is_none_is_not_stated(ends: tuple[float, float]) -> None:
+    """The uncertainty in SI units counted as the share: 0.0175 rad met 20 %, and was shown as 1.75 %."""
+    sheet = angle(low=ends[0], high=ends[1])
+    found = only("uncertainty <= 20 %", sheet)
+    assert (found.result, found.why) == ("skipped", "uncertainty is not stated.")
+    assert only("uncertainty <= 1 deg", sheet).result == "passed"

@@ -503,3 +503,21 @@ def test_a_changed_datasheet_is_held_by_a_profile_or_its_loss_is_named(name, dat
     blocks[number] = blocks[number]._replace(octets=frame(bytes(block)))
     if not lost(blocks, "toml") and blocks[number].access_code != 1:  # the UUID of a Meta-TEDS is the node's
         assert read_blocks(write_blocks(blocks, "toml").encode()) == blocks
+
+
+def test_a_place_that_is_stated_is_kept_also_if_its_channel_is_0() -> None:
+    calibration = teds.compose(5, {"Coefs": [1.0]})
+    text = f"# channel 0 access code 5\n{calibration.hex()}\n# channel 2 access code 5\n{calibration.hex()}\n"
+    assert placed(text.encode()) == {(0, 5): calibration, (2, 5): calibration}
+
+
+def test_comments_of_hex_may_hold_anything_and_make_none_alone() -> None:
+    assert detect(b"00 01\n# a = 1\n") == "hex"
+    assert detect(b"# a = 1\n00 01\n\n") == "hex"
+    assert detect(b"# a = 1\n") == "toml"
+
+
+def test_octets_of_json_count_before_fields_that_make_no_teds() -> None:
+    for fields in ([1], [{"name": "Colour", "value": "red"}], []):
+        entry = {"access_code": 12, "channel": 1, "fields": fields, "octets": NAME.hex(), "edition": None}
+        assert read_blocks(json.dumps({"format": "teds/1", "teds": [entry]}).encode()) == [TedsBlock(1, 12, NAME)]

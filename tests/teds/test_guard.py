@@ -663,3 +663,65 @@ def test_a_channel_without_a_range_of_raw_values_gives_what_its_calibration_cove
     channel = replace(channel_of(1, built(tactile, force_line()), tactile), raw=ends)
     (axis,) = curve_of(force_line(), channel, {}, dense=True).axes
     assert (axis[0], axis[-1]) == (0.0, 65535.0)
+
+
+def test_a_curve_that_must_be_monotone_either_way_says_so(magnetic: Profile) -> None:
+    either = built(magnetic, replace(bent_table(), monotone="either"))
+    assert text(check_calibration(either), "not-monotone").endswith("; its type says that it must be monotone")
+    bent = built(magnetic, bent_table())
+    again = check_calibration(bent, bent)
+    assert (codes(again), codes(again, "warning")) == (set(), {"not-monotone"})
+    assert text(again, "not-monotone").endswith("; nothing here says whether it may")
+
+
+def test_a_fall_of_degrees_celsius_inside_a_curve_is_a_difference() -> None:
+    profile = load_profile("temperature-sensor", [shipped_profiles()])
+    table = fit([(0, -40.0), (10000, 40.0), (21120, 120.0)], "table", channel=1)
+    first, *others = table.coefficients
+    jumping = replace(table, unit=parse_unit("degC"), coefficients=(first + 2.0, *others))
+    assert text(check_calibration(built(profile, jumping), None, profile), "not-monotone") == (
+        "the result falls by 1.992 °C from raw 9999 to 10000; its type says that it must be increasing"
+    )
+
+
+def test_every_number_of_a_calibration_of_two_inputs_is_looked_at(tactile: Profile) -> None:
+    first, second = CalibrationInput(1, 1, (0, 1, 2, 3), (0, 1, 2)), CalibrationInput(2, 0, (0, 9), (0,))
+    line = Calibration(1, "polynomial", (first, second), (0.0, 1.0, 1.0, 1.0, 2.0, 1.0), unit=parse_unit("N"))
+    for changes, word in (
+        ({"coefficients": (0.0, 1.0, math.nan, 1.0, 2.0, 1.0)}, "coefficient 3 of 6 (segment 2)"),
+        ({"inputs": (first, replace(second, boundaries=(0.0, math.inf)))}, "boundary 2 of 2"),
+        ({"inputs": (first, replace(second, offsets=(math.nan,)))}, "offset 1 of 1"),
+        ({"low_limit": 0.0, "high_limit": 9.0, "uncertainty": math.inf}, "limit 3 of 3"),
+    ):
+        findings = check_calibration(built(tactile, replace(line, **changes)), None, tactile)
+        assert text(findings, "erased").startswith(word), word
+
+
+@pytest.mark.parametrize("name", ["low_limit", "high_limit", "uncertainty"])
+def test_a_limit_that_is_not_available_is_no_erased_one(name: str, tactile: Profile) -> None:
+    blocks = built(tactile, replace(force_line(), **{name: math.nan}))  # type: ignore[arg-type]
+    assert "erased" not in codes(check_calibration(blocks, None, tactile))
+
+
+@pytest.mark.parametrize(
+    ("ends", "found"),
+    [
+        ((0.0, 4095.4), None),
+        ((-0.4, 4095.0), None),
+        ((0.0, 4100.0), "110 mm gives raw 4100, raw 5.00005 above the highest raw value of raw 4095"),
+        ((-100.0, 4095.0), "0 mm gives raw -100, raw 100 below the lowest raw value of raw 0"),
+    ],
+)
+def test_a_set_point_may_be_half_a_raw_value_beyond_the_range(ends: tuple[float, float], found: str | None) -> None:
+    profile = load_profile("gripper", [shipped_profiles()])
+    points = [(ends[0], 0.0), (ends[1], 110.0)]
+    line = replace(fit(points, "linear", channel=1, actuator=True), unit=parse_unit("mm"))
+    findings = check_calibration(built(profile, line), None, profile)
+    assert [finding.message for finding in findings if finding.code == "limits"] == ([] if found is None else [found])
+
+
+def test_a_calibration_over_more_than_a_turn_says_so(magnetic: Profile) -> None:
+    doubled = built(magnetic, angle_table(gain=2.0))
+    assert "above the end of the turn that the channel spans of 360 °" in text(
+        check_calibration(doubled, None, magnetic), "limits"
+    )

@@ -706,3 +706,26 @@ def test_the_limits_of_a_value_have_room_for_its_uncertainty_and_for_rounding() 
 )
 def test_which_raw_values_a_form_can_hold(model: int, octets: int, bits: int, ends: tuple[float, float] | None) -> None:
     assert SampleForm(model, octets, bits).raw_range == ends
+
+
+def test_a_limit_of_zero_of_the_calibration_counts() -> None:
+    own = ANGLE.channels[0].calibration
+    assert own is not None
+    for low, high, limits in ((0.0, None, (0.0, 180.0)), (None, 0.0, (-180.0, 0.0))):
+        curve = replace(own, low_limit=low, high_limit=high)
+        narrowed = changed(ANGLE, low=-math.pi, high=math.pi, calibration=curve)
+        assert ChannelInterpreter(narrowed, 1).limits == pytest.approx(limits)
+
+
+def test_an_input_that_a_curve_takes_twice_is_asked_for_once_in_the_order_of_the_inputs() -> None:
+    parts = tuple(CalibrationInput(number, 0, (0, 65535), (0,)) for number in (3, 1, 2, 3))
+    curve = Calibration(1, "polynomial", parts, (1.0,), unit=parse_unit("N"))
+    assert ChannelInterpreter(sheet_of("tactile-finger-sensor", {1: curve}), 1).others == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("stated", "known"), [(0.0, 0.0), (2.0, 2.0), (-1.0, None), (math.nan, None), (math.inf, None)]
+)
+def test_an_uncertainty_of_zero_is_stated_and_one_that_is_none_is_not(stated: float, known: float | None) -> None:
+    sheet = changed(sheet_of("load-cell"), uncertainty=stated)
+    assert ChannelInterpreter(sheet, 1).uncertainty == known

@@ -188,3 +188,26 @@ def test_a_bomb_costs_little(bomb: bytes) -> None:
     with pytest.raises(BadDataError):
         profile_from_xml(bomb, MAP, name="lab")
     assert time.process_time() - began < 1
+
+
+@pytest.mark.parametrize("number", ["-1", "1.5", "\u0663", "two"])
+def test_what_is_no_channel_number_is_named_with_its_place_in_the_file(number: str) -> None:
+    xml = f"<d><c n='1'/><c n='{number}'/></d>".encode()
+    with pytest.raises(BadDataError) as refused:
+        profile_from_xml(xml, "channel = 'c'\n[channel-keys]\nnumber = '@n'\n", name="lab", file="/a/two.xml")
+    assert refused.value.message == f"/a/two.xml, channel 2: {number!r} is no channel number."
+
+
+def test_a_node_has_at_most_255_channels() -> None:
+    for count in (255, 256):
+        xml = b"<d>" + b"<c/>" * count + b"</d>"
+        if count == 255:
+            assert "[channel.255]" in profile_from_xml(xml, "channel = 'c'\n", name="lab")
+        else:
+            with pytest.raises(BadDataError, match=r"^a\.xml has 256 channels; a node has at most 255\.$"):
+                profile_from_xml(xml, "channel = 'c'\n", name="lab", file="a.xml")
+
+
+def test_the_place_of_channels_is_a_text() -> None:
+    with pytest.raises(BadDataError, match=r"^the mapping: channel is missing\.$"):
+        profile_from_xml(XML, "channel = 3\n", name="lab")

@@ -229,6 +229,7 @@ def test_each_part_of_a_picture_is_where_it_belongs(finger) -> None:  # type: ig
     _, lower = drawn(finger.build(UUID, calibration=exact).blocks, exact)
     assert lower.text("set_title").endswith("; stated uncertainty 0.2, far outside")
     assert lower.all("axhline", linestyle="--") == []
+    assert lower.all("axhline") == [(0,)], "what every departure is from"
 
 
 def test_without_points_the_bend_of_the_curve_is_drawn(finger) -> None:  # type: ignore[no-untyped-def]

@@ -475,6 +475,7 @@ def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:
         ('unit = "N"\n', "", 5, "channel.1.unit", "missing"),
         ("low-limit = 0", "low-limit = 11", 9, "channel.1.low-limit", "below the high limit"),
         ("low-limit = 0", 'low-limit = "1 mm"', 9, "channel.1.low-limit", "unit of this channel"),
+        ("low-limit = 0", 'low-limit = "1"', 9, "channel.1.low-limit", '"1" is not in a unit of this channel (N).'),
         (
             "low-limit = 0",
             'low-limit = "1 qq"',
@@ -720,6 +721,9 @@ y = 3
     assert lines["list", 0, "k"] == 12
     assert lines["list", 1, "k"] == 14
     assert lines["list", 1, "sub", "y"] == 16
+    assert (lines["t",], lines["t", "dotted.name"]) == (7, 7)
+    assert (lines["list",], lines["list", 0], lines["list", 1], lines["list", 1, "sub"]) == (11, 11, 13, 15)
+    assert key_lines("[a.b]\nc = 1\n[a]\nd = 2\n")["a",] == 1, "where it is first named"
 
 
 def test_the_template_is_a_profile_without_errors_and_names_every_key(tmp_path: Path) -> None:
@@ -968,6 +972,24 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         ("[channel.1.calibration]\nraw-range = [0, true]\n", "channel.1.calibration.raw-range: two numbers, the lower"),
         ("[channel.1.calibration]\nindication = [0, 1]\n", "channel.1.calibration.indication: slope and intercept are"),
         ("[channel.1.calibration]\nindication = [1, 2, 3]\n", "channel.1.calibration.indication: slope and intercept"),
+        *(
+            (f"[channel.1.calibration]\nindication = {pair}\n", "channel.1.calibration.indication: slope and intercept")
+            for pair in ("[1e39, 0]", "[-1e39, 0]", "[1, 1e39]", "[1, -1e39]", "[true, 0]", "['1', 0]", "[nan, 0]", "3")
+        ),
+        (
+            "[channel.1.calibration]\ninterval = 'soon'\n",
+            "channel.1.calibration.interval: 'soon' is not a time. Write a number of seconds, or",
+        ),
+        *(
+            (
+                f"[channel.1.data-set]\nrepeats = {number}\n",
+                f"channel.1.data-set.repeats: a whole number from 0 to 65535 is expected, not {shown}.",
+            )
+            for number, shown in (("-1", "-1"), ("65536", "65536"), ("true", "True"), ("1.0", "1.0"))
+        ),
+        ("[channel.1-1]\ndirection-angles = [1]\n", "channel.1-1.direction-angles: two angles are expected, not 1."),
+        ("[channel.1-1]\ndirection-angles = 3\n", "channel.1-1.direction-angles: a list is expected, like "),
+        ("[channel.1-1]\ndirection-angles = []\n", "channel.1-1.direction-angles: a list is expected, like "),
         ("[channel.1.calibration]\ninterval = 0\n", "channel.1.calibration.interval: 0 is not a time that a TEDS can"),
         (
             "[channel.1.calibration]\ninterval = 4294967296\n",
@@ -1000,6 +1022,10 @@ def test_every_key_of_a_profile_is_in_the_teds_that_it_builds(tmp_path: Path) ->
         ("[[text]]\nkind = 'title'\n", "text[0].xml: the text is missing."),
         (
             "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'deu'\n",
+            "text[0].language: a language has two letters, like",
+        ),
+        (
+            "[[text]]\nkind = 'title'\nxml = 'x'\nlanguage = 'äö'\n",
             "text[0].language: a language has two letters, like",
         ),
         (
@@ -1044,3 +1070,17 @@ def test_what_is_doubtful_in_a_profile_is_a_warning(tmp_path: Path) -> None:
     ]
     fixed = load_profile(write(tmp_path, "force2", text + "degree = 2\n"))
     assert len(fixed.warnings) == 1
+
+
+def test_an_indication_may_fall_and_a_whole_number_goes_up_to_its_limit(tmp_path: Path) -> None:
+    more = "[channel.1.calibration]\nindication = [-0.5, 3]\n[channel.1.data-set]\nrepeats = 65535\n"
+    (channel,) = load_profile(write(tmp_path, "force", GOOD + more)).channels
+    assert channel.calibration.indication == (-0.5, 3.0)
+    assert dict(channel.fields["DataSet"])["Repeats"] == 65535
+
+
+def test_a_text_is_english_and_of_the_whole_node_unless_the_profile_states_another(tmp_path: Path) -> None:
+    texts = "[[text]]\nkind = 'title'\nxml = 'a'\n[[text]]\nkind = 'title'\nchannel = 1\nxml = 'b'\nlanguage = 'de'\n"
+    profile = load_profile(write(tmp_path, "force", GOOD + texts))
+    assert [(text.channel, text.text, text.language) for text in profile.texts] == [(0, "a", "en"), (1, "b", "de")]
+    assert {(0, 11), (1, 11)} < set(profile.build(UUID).blocks)

@@ -249,3 +249,18 @@ def test_a_finding_of_the_decoder_keeps_its_place_and_its_words() -> None:
     assert (finding.channel, finding.access_code, finding.severity, finding.code) == (2, 12, "error", "frame-checksum")
     assert finding.offset == len(damaged) - 2
     assert finding.message.startswith("The checksum is ")
+
+
+@pytest.mark.parametrize(
+    ("form", "problem"),
+    [
+        (SampleForm(99, 1), "its data model 99 is reserved"),
+        (SampleForm(DataModel.FLOAT32, 5), "its samples are Float32 of 5 octets; 4 are possible"),
+        (SampleForm(DataModel.UNSIGNED, 0), "its samples are unsigned integer of 0 octets; 1 to 8 are possible"),
+        (SampleForm(DataModel.UNSIGNED, 9), "its samples are unsigned integer of 9 octets; 1 to 8 are possible"),
+        (SampleForm(DataModel.UNSIGNED, 1), ""),
+        (SampleForm(DataModel.UNSIGNED, 8), ""),
+    ],
+)
+def test_why_a_sample_cannot_be_read_in_whole_words(form: SampleForm, problem: str) -> None:
+    assert form.problem == problem

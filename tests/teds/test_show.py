@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.teds import show
+from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats import TedsBlock, read_blocks
@@ -354,3 +355,19 @@ def test_a_calibration_without_its_place_is_shown_as_that_of_channel_1():
     beside = {(1, 3): channel}
     for place, text in ((None, "16 Pa"), (1, "16 Pa"), (2, "16")):
         assert texts(describe(TedsBlock(place, 5, calibration), beside, now=NOW))["HiLimit"] == text
+
+
+def test_a_security_teds_of_ours_in_words():
+    point = b"\x04" + bytes(range(64))
+    signed = security.SecurityTeds(
+        point, bytes(64), signature=bytes(64), station_key=point, station_key_signature=bytes(64), ca="Works:00",
+        sequence=0, key_epoch=3,
+    ).encode()  # fmt: skip
+    summary = dict(describe(TedsBlock(0, 128, signed), {(0, 128): signed}, now=NOW).summary)
+    assert (summary["sequence"], summary["key epoch"]) == ("0", "3")
+    assert not {"kind", "form"} & set(summary)
+    block = unframe(signed)
+    swapped = frame(block[:6] + block[9:12] + block[6:9] + block[12:])
+    shown = dict(describe(TedsBlock(0, 128, swapped), {(0, 128): swapped}, now=NOW).summary)
+    assert shown["form"].startswith("not canonical, so never authentic: ")
+    assert "form" not in dict(describe(TedsBlock(0, 128, swapped), now=NOW).summary), "a TEDS alone is shown as it is"

@@ -16,7 +16,7 @@ from teds_provision.teds import Sheet
 from teds_provision.teds.calibration import Calibration, CalibrationInput, ChannelInterpreter, fit, vectorized
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.calibration.vectorized import ManyChannels
-from teds_provision.teds.units import parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_unit
 from tests.cli.shell import python
 from tests.teds.test_interpreter import sheet_of, turned
 
@@ -211,3 +211,21 @@ assert len(_spread((0.0, 200.0), 0.0, 200.0, 50, True))
 print("numpy" in sys.modules, "numpy.ma" in sys.modules)
 """
     assert python(code).out == "True False\n"
+
+
+def test_temperatures_in_several_units_stand_side_by_side() -> None:
+    """Each with its own zero, on the way to the unit of its channel and from there to kelvins."""
+    (own,) = sheet_of("temperature-sensor").channels
+    odd = WrittenUnit("(× 0.5 K + 100 K)", parse_unit("K").units, 0.5, 100.0)  # shown in degrees Celsius
+    units = (parse_unit("degC"), parse_unit("degF"), parse_unit("K"), odd)
+    channels = []
+    for number, unit in enumerate(units, 1):
+        ends = [(0, unit.from_si(250.0)), (65535, unit.from_si(390.0))]
+        curve = replace(fit(ends, "linear", channel=number), unit=unit)
+        channels.append(replace(own, number=number, calibration=curve, sample=SampleForm(0, 2)))
+    known = replace(sheet(), channels=tuple(channels))
+    many = ManyChannels.side_by_side([ChannelInterpreter(known, number) for number in (1, 2, 3, 4)], [True] * 4)
+    assert many is not None
+    value, valid = many.values(np.array([[0] * 4, [65535] * 4]))
+    assert valid.all()
+    assert value == pytest.approx(np.array([[250.0] * 4, [390.0] * 4]), abs=1e-3)

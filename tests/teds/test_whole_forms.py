@@ -476,3 +476,12 @@ def test_a_text_based_teds_has_one_text_of_each_language_in_json_and_xml() -> No
     assert "octets" not in entry, "the directory follows from them"
     assert write_xml([block]).count('<field name="Text">') == 4
     assert read_json(write_json([block])) == read_xml(write_xml([block]).encode()) == [block]
+
+
+@pytest.mark.parametrize(
+    ("flag", "framed"), [("true", True), ("1", True), (" true ", True), ("false", False), ("0", False), (" 0 ", False)]
+)
+def test_a_flag_of_xml_is_a_word_or_a_digit_as_its_schema_has_it(flag: str, framed: bool) -> None:
+    xml = around(f"<teds access-code='12' framed='{flag}'><field name='TCName'><text>a</text></field></teds>")
+    (block,) = read_xml(xml.encode())
+    assert block.octets.startswith(bytes.fromhex("0304000c0101")) is not framed

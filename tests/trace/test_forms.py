@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from teds_provision import __version__
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, UsageError
 from teds_provision.links.ports import Direction
 from teds_provision.trace import pcapng, recorder
@@ -565,3 +566,18 @@ def test_octets_that_a_packet_says_and_lacks_are_named() -> None:
 def test_a_block_that_is_too_short_or_of_no_interface_is_named(block: bytes) -> None:
     with pytest.raises(BadDataError, match=r"^The pcapng block at octet \d+ does not parse"):
         list(pcapng.read_pcapng(pcapng.head() + block))
+
+
+def test_a_trace_begins_with_its_format_and_who_made_it() -> None:
+    assert lines.head().count(b"\n") == 1
+    assert json.loads(lines.head()) == {"format": "teds-trace/1", "made_by": f"teds-provision {__version__}"}
+
+
+def test_of_several_comments_of_a_message_the_first_of_words_is_its_name() -> None:
+    comments = (b"node: 8d4d", b"List", b"a note of a person, not opened", b"link: nfc frame")
+    options = b"".join(option(1, comment) for comment in comments)
+    (record,) = pcapng.read_pcapng(pcapng.head() + packet(2, 0, b"\1", options + END))
+    assert (record.command, record.sealed, record.uuid) == ("List", False, "8d4d")
+    assert (record.link, record.layer) == ("nfc", "frame")
+    (bare,) = pcapng.read_pcapng(pcapng.head() + packet(2, 0, b"\1", OUT + END))
+    assert (bare.command, bare.link, bare.layer, bare.sealed, bare.uuid) == ("", "", "message", False, "")

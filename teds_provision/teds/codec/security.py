@@ -287,11 +287,11 @@ def _places(block: bytes) -> list[tuple[int, int, int]]:
             end = start + block[at + 1]
             places.append((block[at], start, end))
             at = end
-    except IndexError:
+    except IndexError:  # a type alone, without its length
+        places.append((block[at], start, start))
         at = size + 1
     if at > size:
-        number = places[-1][0] if places else block[0]
-        raise BadDataError(f"The tuple of type {number} runs past the end of the data block.")
+        raise BadDataError(f"The tuple of type {places[-1][0]} runs past the end of the data block.")
     return places
 
 

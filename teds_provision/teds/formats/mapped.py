@@ -21,7 +21,7 @@ from teds_provision.limits import LIMITS, check_size, check_xml, load_toml
 
 _TABLES: Final = frozenset({"channel", "keys", "channel-keys", "values", "channel-values"})
 _PLACE: Final = frozenset({"at", "unit", "unit-at", "words"})
-_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _PATH: Final = re.compile(r"[\w.-]+(/[\w.-]+)*")
 _LONGEST: Final = 200
 _MOST_CHANNELS: Final = 255
