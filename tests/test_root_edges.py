@@ -551,3 +551,61 @@ def test_json_in_octets_is_read_in_the_encoding_that_it_shows(encoding: str) -> 
 def test_a_number_has_its_noun_in_singular_or_plural() -> None:
     assert [counted(number, "day") for number in (0, 1, 2)] == ["0 days", "1 day", "2 days"]
     assert [counted(number, "entry", "entries") for number in (0, 1, 2)] == ["0 entries", "1 entry", "2 entries"]
+
+
+@pytest.mark.parametrize(
+    ("text", "why", "with_file"),
+    [
+        ("", "The list is empty.", "a.json:1: The list is empty."),
+        (b" \n", "The list is empty.", "a.json:1: The list is empty."),
+        ('{"a":\n}', "The list is not JSON: line 2: Expecting value.", "a.json:2: this is not JSON: Expecting value."),
+        (b'["\xff"]', "The list is not text: it is binary, or not UTF-8.",
+         "The list is not text: it is binary, or not UTF-8."),
+        ("[" * 100_000, "The list is nested too deeply.", "a.json:1: The list is nested too deeply."),
+        (b"123456789", "The list has 9 octets; at most 8 are read.", "The list has 9 octets; at most 8 are read."),
+    ],
+)  # fmt: skip
+def test_why_json_of_a_stranger_is_refused(text: str | bytes, why: str, with_file: str) -> None:
+    octets = 8 if text == b"123456789" else 1 << 20
+    for file, message in (("", why), ("a.json", with_file)):
+        with pytest.raises(BadDataError) as refused:
+            limits.load_json(text, "the list", octets=octets, file=file)
+        assert refused.value.message == message
+    assert limits.load_json(b"12345678", "the list", octets=8) == 12345678
+
+
+@pytest.mark.parametrize("code", ["EINVAL", "ENOTSUP", "ENOSYS", "EROFS", "EACCES", "EIO"])
+def test_a_folder_that_its_file_system_cannot_bring_to_the_disk_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
+) -> None:
+    synced: list[int] = []
+
+    def refuse(descriptor: int) -> None:
+        synced.append(descriptor)
+        raise OSError(getattr(errno, code), "refused")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    if code == "EIO":
+        with pytest.raises(OSError, match="refused"):
+            files.sync_folder(tmp_path)
+    else:
+        files.sync_folder(tmp_path)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(synced[0])
+
+
+def test_a_pipe_that_is_refused_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    opened: list[int] = []
+    real = os.open
+
+    def noted(*words: Any) -> int:
+        opened.append(real(*words))
+        return opened[-1]
+
+    monkeypatch.setattr(os, "open", noted)
+    with pytest.raises(NotFoundError) as refused:
+        files._opened(tmp_path / "pipe")
+    assert refused.value.message == f"{tmp_path / 'pipe'} is a pipe, not a file."
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(opened[0])

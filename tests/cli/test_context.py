@@ -362,3 +362,22 @@ def test_json_is_indented_if_asked_for_and_steers_no_terminal(monkeypatch: pytes
     monkeypatch.setattr(context.sys, "stdout", io.StringIO())
     assert to_json({"a": [1]}, indent=1) == '{\n "a": [\n  1\n ]\n}'
     assert to_json({"a": "\u202eä"}) == '{"a": "\\u202eä"}'
+
+
+@pytest.mark.parametrize(
+    ("facts", "logged", "no_input"),
+    [
+        ({}, [], False),
+        ({"verbose": 1}, [{"logging_level": 20, "libraries": False}], False),
+        ({"verbose": 2, "as_json": True}, [{"logging_level": 10, "libraries": False}], True),
+        ({"debug": True, "no_input": True}, [{"logging_level": 10, "libraries": True}], True),
+        ({"verbose": 1, "debug": True}, [{"logging_level": 10, "libraries": True}], False),
+    ],
+)
+def test_what_is_logged_and_whether_a_person_is_asked_follow_from_the_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, facts: dict[str, Any], logged: list[Any], no_input: bool
+) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(context, "_log_to_stderr", lambda **how: asked.append(how))
+    app = App(home=tmp_path, **facts)
+    assert (asked, app.no_input, App.current) == (logged, no_input, app)

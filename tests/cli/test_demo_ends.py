@@ -460,3 +460,22 @@ def test_the_gripper_of_the_story_is_operated_twice_and_is_safe_in_the_end(
     assert course == [(("can", bytes(10), "demo"), 1, "mm"), 40.0, ("wait", waited), 40.0, "let go"]
     details = [step.detail for step in demo.steps.done]
     assert details == (["hand: opening 40.12 mm, then back to its safe state"] if safe else [])
+
+
+def test_the_story_rotates_the_key_over_the_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    course: list[Any] = []
+
+    def agree(*words: Any, **how: Any) -> Any:
+        course.append((words, how))
+        return SimpleNamespace(epoch=2, key_id="0123")
+
+    monkeypatch.setattr(story, "provision_over", lambda _demo, _station, via, uuid, order: course.append((via, order)))
+    monkeypatch.setattr(story, "meet", lambda _station, via, uuid, _reporter: nullcontext(f"node over {via}"))
+    monkeypatch.setattr(story, "identify", lambda _station, node: f"identity of {node}")
+    monkeypatch.setattr(story, "agree", agree)
+    demo = demo_in(tmp_path)
+    story._over_can(demo, "station")  # type: ignore[arg-type]
+    (via, order), agreed = course
+    assert (via, order.profile, order.name) == ("can", story.PROFILE, "crane slew angle")
+    assert agreed == (("station", "node over can", "identity of node over can"), {"rotate": True})
+    assert [(step.name, step.detail) for step in demo.steps.done] == [("rotate", "key epoch 2, key 0123")]

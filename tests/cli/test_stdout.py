@@ -11,8 +11,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.control import Control
+from rich.text import Text
 
 from teds_provision.cli import main, stdout
+from teds_provision.cli.console import CleanConsole
 from teds_provision.cli.context import App
 from teds_provision.cli.stdout import CleanText
 from teds_provision.errors import StoreError
@@ -263,3 +266,13 @@ def test_the_guarded_output_goes_on_where_the_plain_one_ended(monkeypatch: pytes
     assert (guarded.encoding, guarded.errors, guarded.line_buffering) == ("ascii", "backslashreplace", terminal)
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     assert stdout.guard() is None
+
+
+def test_a_text_of_the_console_is_cleaned_and_keeps_its_colour() -> None:
+    console = CleanConsole(file=io.StringIO(), width=80)
+    found = [part for part in console.render(Text("a\u202eb", style="red")) if part.text.strip()]
+    assert [(part.text, str(part.style)) for part in found] == [(sanitize("a\u202eb"), "red")]
+    [bell] = console.render(Control.bell())
+    assert (bell.text, bell.control is None) == ("\a", False), "what rich itself steers"
+    with pytest.raises(BrokenPipeError):
+        console.on_broken_pipe()

@@ -1028,3 +1028,36 @@ def test_a_vault_in_the_keyring_is_named_as_the_keyring_names_it(
 def test_which_octets_are_a_private_key(tmp_path: Path, octets: bytes, holds: bool) -> None:
     (tmp_path / "a").write_bytes(octets)
     assert station.holds_private_key(tmp_path / "a") is holds
+
+
+def test_seals_that_are_broken_or_not_checked_have_their_remedy(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[str] = []
+
+    def all_broken(sample: RowSample) -> list[str]:
+        sample.sampled = True
+        return found
+
+    opened = SimpleNamespace(
+        identity=SimpleNamespace(keystore="file"), unlock=lambda: None, close=lambda: None,
+        row_macs=SimpleNamespace(all_broken=all_broken),
+    )  # fmt: skip
+    monkeypatch.setattr(fleet, "has_store", lambda _home: True)
+    monkeypatch.setattr(fleet.Station, "open", lambda _home, *, ask: opened)
+    asked = replace(system, ask=lambda _prompt, _confirm: "x")
+    unchanged = "Pins, trust and the station's own CA are unchanged"
+    assert one(fleet.seals(asked)) == Finding(
+        "seals", "ok",
+        f"{unchanged}, of each large table the newest and 5,000 random rows (doctor --full checks all).", "",
+        sampled=True,
+    )  # fmt: skip
+    assert one(fleet.seals(system)).fix == "teds-provision --passphrase-fd 3 doctor 3<FILE"
+    found.append("pin 8d4d")
+    assert one(fleet.seals(asked)).fix == (
+        "Remove them (whitelist remove, trust remove), find out who changed the file, and add them again."
+    )
+    for error, result in ((WrongPassphraseError("Wrong.", hint="Again."), "skipped"),
+                          (StoreChangedError("Changed.", hint="Restore."), "failed")):  # fmt: skip
+        monkeypatch.setattr(opened, "unlock", raising(error))
+        assert one(fleet.seals(asked)) == Finding("seals", result, error.message, error.hint)  # type: ignore[arg-type]
