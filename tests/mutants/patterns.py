@@ -6333,6 +6333,8 @@ PATTERNS = (
         "max(1, min(self._max_le, 255))",
         "min(self._max_le, 255)",
         "tests/links/nfc/test_nfc_reads.py",
+    ),
+    Pattern(
         "a low limit of 0 of a calibration counts",
         "ChannelInterpreter._limits",
         "own.low_limit is not None",
