@@ -83,6 +83,27 @@ PATTERNS = (
         "tests/plant/test_line_rules.py",
     ),
     Pattern(
+        "a calibration of another channel is none of this one's",
+        "_channel",
+        "(number, AccessCode.CALIBRATION) in image.blocks",
+        "any((code == AccessCode.CALIBRATION for _, code in image.blocks))",
+        "tests/station/test_summary.py",
+    ),
+    Pattern(
+        "a rotation that is due for another reason keeps it",
+        "_mark",
+        "already.startswith(STOLEN) or not already.startswith(REMOVED)",
+        "already.startswith(STOLEN)",
+        "tests/plant/test_removed_rules.py",
+    ),
+    Pattern(
+        "entries are chosen from the very second on",
+        "_terms",
+        '" AND at >= \'"',
+        '" AND at > \'"',
+        "tests/station/test_store_edges.py",
+    ),
+    Pattern(
         "pages follow in the order of their numbers",
         "_follows",
         "sorted(new, key=lambda page: page.number)",

@@ -103,6 +103,15 @@ def test_evidence_keeps_its_file_when_the_clock_was_set_back(station: Station, t
     assert [(proof / name).read_bytes() for name in (first, second)] == [ahead, right]
 
 
+def test_of_two_files_with_one_document_the_one_with_its_number_is_meant(station: Station, tmp_path: Path) -> None:
+    uuid = bytes(range(10))
+    kept_evidence(station, uuid, "2026-11-28T10:00:00Z", b"one")
+    two = kept_evidence(station, uuid, "2026-11-28T11:00:00Z", b"two")
+    for number in (1, 2, 3):
+        (tmp_path / f"{uuid.hex()}.{number}.json").write_bytes(two)
+    assert exported(station, tmp_path) == {f"{uuid.hex()}.4.json": True, f"{uuid.hex()}.2.json": False}
+
+
 def test_public_verifiers_accept_it(station: Station, document: bytes) -> None:
     """securesystemslib and in-toto-attestation know nothing of us: the key, and what was signed."""
     envelope = Envelope.from_dict(json.loads(document))

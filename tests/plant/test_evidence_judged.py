@@ -70,6 +70,7 @@ ROLE = "the station that signed the datasheet does not have the role 'sign'"
         (roster(line=()), {}, ["its station has no role for working on boards"]),
         (roster(gone="lost"), {}, ["its station was removed: lost"]),
         (roster(gone="stolen"), {}, ["its station was removed: stolen"]),
+        (roster(line=("line", "sign"), gone="lost"), {"signer": LINE}, ["its station was removed: lost"]),
         (roster(), {"by": STRANGER}, ["its station is not in the roster"]),
         (roster(office_gone="stolen"), {}, ["the station that signed the datasheet was removed: stolen"]),
         (roster(), {"signer": STRANGER}, ["the station that signed the datasheet is not in the roster"]),

@@ -14,7 +14,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, RosterExpiredError
-from teds_provision.plant import jobs
+from teds_provision.plant import jobs, line
 from teds_provision.plant.jobs import close_job, job_id, read_job, require_open, take_job
 from teds_provision.plant.line import LineRun, LineUnit, Scans, _firmware_in_session, _step_facts
 from teds_provision.protocol.keys import SoftwareKey
@@ -528,6 +528,23 @@ def test_the_steps_of_evidence_have_whole_milliseconds_and_the_failure_stands_ap
     assert _step_facts(steps) == (
         ("agree", "done", 2), ("sign", "nothing to do", 0), ("write", "skipped", 0), ("verify", "done", 1251)
     )  # fmt: skip
+
+
+def test_the_label_of_each_board_that_passed_has_its_uuid_and_the_chosen_ending(
+    owner: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, cleared, written = LineRun(owner, job(owner)), list[bytes](), list[tuple[str, Path, bool]]()
+    monkeypatch.setattr(line, "label_of", lambda station, uuid: uuid.hex() if station is owner else "")
+    monkeypatch.setattr(line, "write_label", lambda text, path: written.append((text, path, path.parent.is_dir())))
+    run.scans = cast("Scans", SimpleNamespace(clear=cleared.append))
+    run.passed_board(A)
+    assert written == []
+    run.label_to = tmp_path / "new" / "labels" / "x.png"
+    for uuid in (A, B):
+        run.passed_board(uuid)
+    folder = run.label_to.parent
+    assert written == [(uuid.hex(), folder / f"{uuid.hex()}.png", True) for uuid in (A, B)]
+    assert cleared == [A, A, B], "the next board is another one"
 
 
 def test_a_unit_belongs_to_its_job(owner: Station) -> None:

@@ -167,6 +167,20 @@ def test_the_secret_of_the_login_is_kept_under_the_newest_master_key(station: St
                 rewrap(station)
 
 
+def test_a_home_that_has_its_own_pages_again_keeps_no_mark_of_its_backup(station: Station) -> None:
+    station.unlock()
+    before = station.plant.record()
+    station.plant.begin_restored()
+    marked = station.plant.record()
+    assert marked is not None
+    assert None not in (marked.restored, marked.restored_mac)
+    station.plant.end_restored()
+    after = station.plant.record()
+    assert after == before
+    assert after is not None
+    assert (after.restored, after.restored_mac) == (None, None)
+
+
 def test_a_request_of_another_name_is_made_anew_with_the_same_login(station: Station) -> None:
     station.unlock()
     first = open_request(request(station))

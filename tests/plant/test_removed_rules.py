@@ -155,6 +155,21 @@ def test_a_review_counts_what_only_a_station_that_left_held_and_is_made_again_wh
     assert again != later, "another station left"
 
 
+def test_a_rotation_that_is_due_for_another_reason_keeps_it(station: Station) -> None:
+    now = dated(station, held(station, *others(station, west="line"), removed=(LOST,)))
+    moved, plain = (bytes([number] * 10) for number in (1, 2))
+    claim = Claim(agreed=(3, "a1" * 8, "cd" * 32)).to_json()
+    for uuid in (moved, plain):
+        station.keys.add_pending(uuid, key=bytes(16), key_id=b"\xa1" * 8, epoch=3)
+    station.keys.demand_rotation(moved, "it came from another station")
+    with station.transaction():
+        station.plant.claims.put(station.plant.pages.chain(LOST.fingerprint).id, {moved: claim, plain: claim})
+    assert review(station, now, NOW) is not None
+    assert [station.keys.rotation_due(uuid) for uuid in (moved, plain)] == [
+        "it came from another station", "registry: station south (lost) has held this key"
+    ]  # fmt: skip
+
+
 def test_who_agreed_a_key_itself_is_in_turn(station: Station) -> None:
     roster = station.plant.roster
     assert roster is not None

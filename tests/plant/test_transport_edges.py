@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -757,6 +758,24 @@ def test_an_answer_that_cannot_be_read_is_for_no_request(monkeypatch: pytest.Mon
     assert office._answered(b"answer") == ("", "")
     monkeypatch.setattr(sign_requests.jose, "verify_compact", raises(error))
     assert office._answered(b"answer") == ("", "")
+
+
+def test_an_answer_is_looked_for_less_and_less_often_and_its_parcel_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent, waits, gone = list[Any](), list[Any](), list[str]()
+    answer = stub(document=b"answer", drop=lambda: gone.append("dropped"))
+    found = iter([*([] for _ in range(7)), [answer]])
+    office: Any = RemoteOffice.__new__(RemoteOffice)
+    office.station, office.transport, office.timeout = "station", "transport", 60.0
+    office._news, office._came, office._looking = threading.Condition(), {}, False
+    office._inbox = stub(collect=lambda: next(found), wait=lambda most, pause: waits.append((most, pause)))
+    office._answered = lambda document: ("office", "H") if document == b"answer" else ("", "")
+    monkeypatch.setattr(sign_requests, "time", stub(monotonic=lambda: 100.0))
+    monkeypatch.setattr(sign_requests, "send", lambda *given: sent.append(given))
+    monkeypatch.setattr(sign_requests, "name_of", lambda hash: f"name of {hash}")
+    assert office.request_signature(stub(to="office", hash="H", octets=b"request")) == b"answer"
+    assert sent == [("station", "transport", "office", b"request", "name of H")]
+    assert (waits, gone) == ([(1.0, pause) for pause in (0.05, 0.1, 0.2, 0.4, 0.8, 1.0, 1.0)], ["dropped"])
+    assert (office._came, office._looking) == ({}, False), "another thread may look now"
 
 
 def test_a_transport_of_another_registry_is_not_used(station: Station) -> None:

@@ -297,6 +297,18 @@ def test_the_database_is_checked_at_the_first_sync_and_each_hour(home: Plant, mo
     assert checks == [(now, home.north, transport) for now in (0.0, 3600.0, 7200.0)]
 
 
+def test_the_page_of_the_day_is_written_before_the_sync_that_sends_it(
+    home: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course, watch = list[str](), watching(home.north)[0]
+    monkeypatch.setattr(connecting, "open_transport", lambda station: SimpleNamespace())
+    monkeypatch.setattr(connecting, "check_database", lambda *_: course.append("check"))
+    monkeypatch.setattr(plant.sync, "sync", lambda *_: course.append("sync") or SyncResult())
+    monkeypatch.setattr(watch, "_say_daily", lambda: course.append("page"))
+    watch._sync()
+    assert course == ["page", "sync", "check"]
+
+
 @pytest.mark.parametrize(("busy", "seconds"), [(True, 2.0), (False, 60.0)])
 def test_the_next_sync_comes_after_a_minute_or_soon_if_another_one_ran(
     home: Plant, monkeypatch: pytest.MonkeyPatch, busy: bool, seconds: float

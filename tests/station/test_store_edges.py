@@ -23,7 +23,7 @@ from teds_provision.station import snapshot
 from teds_provision.station.groups import Groups
 from teds_provision.station.station import Station
 from teds_provision.station.store import connection, database, dump, lock, row_sample
-from teds_provision.station.store.audit import _linked
+from teds_provision.station.store.audit import ACTOR, AuditFilter, _entry, _linked
 from teds_provision.station.store.database import Database, open_copy
 from teds_provision.station.store.lock import NodeLock, OwnerLock, StoreLock, UsageLock, UsageLockTakenError
 from teds_provision.station.store.row_sample import _between, _Column
@@ -430,6 +430,34 @@ def test_a_log_is_checked_from_an_entry_that_is_there(store: Store) -> None:
     assert store.audit.check(2).intact
     verdict = store.audit.check(9)
     assert (verdict.intact, verdict.first_bad, verdict.count, verdict.why) == (False, 9, 8, "entry 9 is missing")
+
+
+@pytest.mark.parametrize("text", ["[1]", "null", "7", "{", ""])
+def test_details_of_an_entry_that_are_no_object_are_shown_as_they_stand(text: str) -> None:
+    assert _entry(1, "", "", "verify", None, "done", text, b"").detail == {"unreadable": text}
+
+
+def test_a_part_of_a_text_is_found_in_every_column_and_signs_of_sql_stand_for_themselves(store: Store) -> None:
+    store.audit.append("verify", NODE, "refused", {"why": "50% of_it!"})
+    before = ACTOR.set("token lab")
+    try:
+        store.audit.append("write", None, "done")
+    finally:
+        ACTOR.reset(before)
+
+    def found(**choice: Any) -> list[str]:
+        return [entry.act for entry in store.audit.chosen(AuditFilter(**choice))]
+
+    for text in ("erif", "efuse", "50%", "of_it!", "00010203", "%", "_", "!"):
+        assert found(text=text) == ["verify"], text
+    assert found(text="en la") == found(text="rit") == ["write"]
+    for text in ("0%f", "e_u", "'", "\0"):
+        assert found(text=text) == [], text
+    at = next(iter(store.audit.entries(0))).at
+    assert found(since=at) == found(since="'") == ["verify", "write"], "from that second on"
+    assert (found(act="verify\0"), found(act="it's")) == (["verify"], [])
+    second = store.audit.newest()[0]
+    assert [found(before=number) for number in (second + 1, second)] == [["verify", "write"], ["verify"]]
 
 
 def test_counts_and_what_is_wrong_with_the_file(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
