@@ -6481,6 +6481,34 @@ PATTERNS = (
         "(text for text in reversed(comments) if not text.startswith((_OPENED, _UUID, _LINK)))",
         "tests/trace/test_forms.py",
     ),
+    Pattern(
+        "a device is gone by the name of bleak's error alone",
+        "is_gone",
+        "type(error).__name__ == 'BleakDeviceNotFoundError'",
+        "False",
+        "tests/links/ble/test_words.py",
+    ),
+    Pattern(
+        "a station is not offered its own address",
+        "AddressConflicts.hint",
+        "0xF2 if self._own == 0xF1 else 0xF1",
+        "0xF2",
+        "tests/links/can/test_replies_heard.py",
+    ),
+    Pattern(
+        "a board without a session has no actuator to ask in it",
+        "Updates.require_free",
+        "trusted is not None and trusted.node.sealed",
+        "trusted is not None",
+        "tests/ncap/test_update_actions.py",
+    ),
+    Pattern(
+        "a server without a certificate has no TLS",
+        "Servers.serve",
+        "settings is not None and settings.certificate is not None",
+        "settings is not None",
+        "tests/ncap/test_connections.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import h11
 import pytest
@@ -182,3 +182,50 @@ def test_of_clients_with_a_token_the_one_that_was_silent_longest_makes_room(monk
         assert await answer(oldest, KNOWN) == b"HTTP/1.1 200 OK\r\n"
 
     served(work)
+
+
+@pytest.mark.parametrize("certificate", [None, "cert.pem"])
+def test_a_server_bounds_what_a_client_sends_and_believes_no_proxy(
+    monkeypatch: pytest.MonkeyPatch, certificate: str | None
+) -> None:
+    kept: list[dict[str, Any]] = []
+    listeners: list[Any] = []
+    failures: list[OSError | None] = [None, OSError("The socket is closed.")]
+
+    class MockServer:
+        started = False
+
+        def __init__(self, config: Any) -> None:
+            kept.append(config)
+
+        async def serve(self, sockets: list[Any]) -> None:
+            listeners.append(sockets)
+            if failure := failures.pop(0):
+                raise failure
+            self.started = True
+
+    monkeypatch.setattr(server.uvicorn, "Config", lambda app, **settings: {"app": app, **settings})  # type: ignore[attr-defined]
+    monkeypatch.setattr(server, "_Server", MockServer)
+    app, listener, settings = (
+        cast("Any", object()),
+        cast("Any", object()),
+        SimpleNamespace(certificate=certificate, key="key.pem"),
+    )
+
+    async def run() -> None:
+        servers = server.Servers()
+        await servers.serve(app, listener, cast("Any", settings))
+        with pytest.raises(OSError, match=r"The socket is closed\."):
+            await servers.serve(app, listener)
+
+    asyncio.run(run())
+    bounds = {
+        "app": app, "proxy_headers": False, "server_header": False, "access_log": False, "log_level": "critical",
+        "log_config": None, "lifespan": "off", "http": server.HttpConnection, "ws": "websockets-sansio",
+        "ws_max_size": 65_536, "ws_per_message_deflate": False, "h11_max_incomplete_event_size": 32_768,
+        "limit_concurrency": 2000, "timeout_keep_alive": 30, "timeout_graceful_shutdown": server._ENDING,
+    }  # fmt: skip
+    plain = {"ssl_certfile": None, "ssl_keyfile": None}
+    tls = {"ssl_certfile": certificate, "ssl_keyfile": "key.pem"} if certificate else plain
+    assert kept == [bounds | tls, bounds | plain]
+    assert listeners == [[listener]] * 2

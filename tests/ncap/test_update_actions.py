@@ -717,3 +717,27 @@ def test_as_many_boards_are_planned_at_once_as_was_asked_for(bench: Bench, monke
     monkeypatch.setattr(updates, "ParallelWork", work)
     bench.updates.plan(b"x", UpdateRequest((NODE, OTHER, "ef" * 10), parallel=2), owner="page")
     assert asked == [(3, 2)]
+
+
+def test_a_board_is_free_if_nobody_holds_an_actuator_of_its_measurement(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that is suspended gets no set points from a topic, and one without a session has none to ask in."""
+    asked: list[Any] = []
+    monkeypatch.setattr(updates, "require_free_actuators", asked.append)
+    node = SimpleNamespace(sealed=True)
+    for trusted in (None, FrozenError("It is suspended."), SimpleNamespace(node=SimpleNamespace(sealed=False))):
+        bench.trusted = trusted
+        bench.updates.require_free(NODE)
+    assert asked == []
+    bench.trusted = SimpleNamespace(node=node)
+    bench.updates.require_free(NODE)
+    assert asked == [node]
+    silent = LinkError("Silent.")
+    bench.trusted = SessionLostError(silent)
+    with pytest.raises(LinkError) as lost:
+        bench.updates.require_free(NODE)
+    assert lost.value is silent
+    bench.trusted, bench.held = None, [2]
+    with pytest.raises(PolicyError, match="Actuator 2 of the board is in use"):
+        bench.updates.require_free(NODE)

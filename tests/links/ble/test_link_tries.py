@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeSilentError
+from teds_provision.errors import LinkError, NodeSilentError
 from teds_provision.links.ble import link as of_link
 from teds_provision.links.ble.connection import ConnectionLostError, NotConnectedError
 from teds_provision.links.ble.link import BleLink
@@ -111,3 +111,31 @@ def test_a_drive_message_that_finds_no_connection_says_so(monkeypatch: pytest.Mo
     assert written == [b"\1drive", b"\2drive"]
     assert silent.value.message == "The node at C1 does not answer over BLE (gone)."
     assert silent.value.hint == "Bring it closer. It advertises for 60 s after a tap, and while it has a key."
+
+
+def test_what_a_thread_no_longer_waits_for_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    cancelled, results = list[bool](), [KeyboardInterrupt(), LinkError("Gone."), None]
+
+    class Running:
+        def result(self) -> str:
+            if failure := results.pop(0):
+                raise failure
+            return "done"
+
+        def cancel(self) -> None:
+            cancelled.append(True)
+
+    given: list[Any] = []
+    monkeypatch.setattr(
+        of_link.asyncio,
+        "run_coroutine_threadsafe",
+        lambda work, loop: given.append((work, loop)) or Running(),  # type: ignore[attr-defined, func-returns-value]
+    )
+    loop: Any = of_link.Loop.__new__(of_link.Loop)
+    loop._loop = "its loop"
+    for error in (KeyboardInterrupt, LinkError):
+        with pytest.raises(error):
+            loop.run("work")
+    assert cancelled == [True, True]
+    assert loop.run("work") == "done"
+    assert (len(cancelled), given) == (2, [("work", "its loop")] * 3)

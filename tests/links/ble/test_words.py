@@ -242,3 +242,21 @@ def test_a_bluetoothd_that_does_not_run_or_refuses_is_named_and_its_bus_closed(s
         asyncio.run(bluez._adapters(None))
     assert (refused.value.type, refused.value.text) == (name, "['Not for you']")
     assert system_bus.ended == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "dbus_error", "text", "gone"),
+    [
+        ("BleakDBusError", "org.freedesktop.DBus.Error.UnknownObject", "x", True),
+        ("BleakDBusError", "org.freedesktop.DBus.Error.UnknownMethod", "x", True),
+        ("BleakDBusError", "org.bluez.Error.InProgress", "x", False),
+        ("BleakDeviceNotFoundError", "", "x", True),
+        ("BleakError", "", "device 'dev_C1' not found", True),
+        ("BleakError", "", "x", False),
+    ],
+)
+def test_a_device_that_bluez_has_forgotten_is_known_by_each_of_its_words(
+    name: str, dbus_error: str, text: str, gone: bool
+) -> None:
+    error = type(name, (Exception,), {"dbus_error": dbus_error})(text)
+    assert ble_errors.is_gone(error) is gone

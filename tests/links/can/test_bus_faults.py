@@ -431,3 +431,9 @@ def test_an_interface_whose_driver_is_missing_names_it(monkeypatch: pytest.Monke
         Bus(parse_spec("kvaser:0"))
     assert no.value.message == "Cannot use CAN interface 'kvaser' here: no library."
     assert no.value.hint == "It needs Kvaser's CANlib (linuxcan, from kvaser.com)."
+
+
+def test_a_socketcand_that_is_not_there_is_started_or_named_with_its_host() -> None:
+    assert bus_module._cure(parse_spec("socketcand:can0?host=desk&port=1")) == (
+        "Start socketcand there, or give its address: socketcand:can0?host=127.0.0.1&port=29536."
+    )

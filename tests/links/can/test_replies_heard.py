@@ -408,3 +408,12 @@ def test_data_are_taken_of_open_streams_that_are_for_this_station(bus: MockBus, 
     streams.open(0x22, 0, 4, fd=False)
     now -= 10.0  # of a run before it
     assert taken() == []
+
+
+@pytest.mark.parametrize(("own", "free"), [(0xF1, "F2"), (0xF2, "F1"), (0xF7, "F1")])
+def test_a_station_whose_address_another_one_uses_is_offered_another_one(own: int, free: str) -> None:
+    conflicts = AddressConflicts(own, lambda: 0.0)
+    assert conflicts.text == f"Another base station on this bus uses this station's source address 0x{own:02X}."
+    assert conflicts.hint == (
+        f"Give each station its own address, 0xF1 to 0xF7: add source=0x{free} to --can of one of them."
+    )

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.links.nfc import hints, nfcpy, reader
+from teds_provision.links.nfc import hints, nfcpy, reader, udp
 from teds_provision.links.nfc.nfcpy import nfc
 from teds_provision.links.nfc.reader import Reader
 from teds_provision.links.nfc.tag import ReaderLostError
@@ -250,3 +250,26 @@ def test_only_what_nfcpy_has_a_driver_for_is_a_reader(monkeypatch: pytest.Monkey
     assert reader._usb_readers("usb") == [(*ACR, 1, 5), (0x054C, 0x06C3, 2, 7)]
     assert reader._usb_readers("usb:001") == []
     assert asked == ["usb", "usb:001"]
+
+
+@pytest.mark.parametrize(
+    ("path", "address"),
+    [
+        ("udp", ("127.0.0.1", 54321)),
+        ("udp:localhost", ("127.0.0.1", 54321)),
+        ("udp:127.0.0.1:1", ("127.0.0.1", 1)),
+        ("udp::65535", ("127.0.0.1", 65535)),
+        ("udp:localhost:65536", "Write udp:localhost:PORT."),
+        ("udp:localhost:0", "Write udp:localhost:PORT."),
+        ("udp:localhost:1:2", "Write udp:localhost:PORT."),
+        ("tcp:localhost:1", "Write udp:localhost:PORT."),
+        ("udp:10.0.0.1:1", "Use udp:localhost:PORT; anyone who can reach the port could write to the node."),
+    ],
+)
+def test_the_address_of_a_simulated_reader_has_defaults_and_is_of_this_machine(path: str, address: Any) -> None:
+    if isinstance(address, tuple):
+        assert udp.address_of(path) == address
+        return
+    with pytest.raises(UsageError) as no:
+        udp.address_of(path)
+    assert no.value.hint == address
