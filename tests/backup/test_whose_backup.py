@@ -20,6 +20,7 @@ from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import (
     BadDataError,
     NotAuthenticError,
+    NotFoundError,
     PolicyError,
     StoreChangedError,
     StoreError,
@@ -286,3 +287,34 @@ def test_a_file_beyond_the_bound_is_not_opened(
     monkeypatch.setattr(sealed_file, "MAX_OCTETS", size - 1)
     with pytest.raises(BadDataError, match="larger than"):
         SealedFile(tmp_path / "b")
+
+
+HEAD = b'{"format":"teds-backup/2"'
+OTHER, TORN = "not a backup of this version of teds-provision", "truncated in its header, or damaged"
+
+
+@pytest.mark.parametrize(
+    ("octets", "why"),
+    [
+        (HEAD + b',"key":{"protected":"x"}}\n', ""),
+        (HEAD + b',"key":{"kdf":"x"}}\n', ""),
+        (b"", "This is not a backup."),  # with its full stop
+        (b"a letter\n", "This is not a backup."),
+        (b'{"format":"teds-backup/3"}\n', OTHER),
+        (b" " + HEAD + b',"key":{"kdf":"x"}}\n', OTHER),
+        (HEAD + b',"key":{"kdf":"x"}}', TORN),
+        (HEAD + b',"key":[]}\n', TORN),
+        (HEAD + b"}\n", TORN),
+    ],
+)
+def test_what_the_first_line_of_a_backup_has_to_be(tmp_path: Path, octets: bytes, why: str) -> None:
+    (tmp_path / "b").write_bytes(octets)
+    if why:
+        with pytest.raises(BadDataError) as refused:
+            SealedFile(tmp_path / "b")
+        assert why in refused.value.message
+        return
+    file = SealedFile(tmp_path / "b")
+    assert (file.octets, file.is_for_key) == (len(octets), b"protected" in octets)
+    with pytest.raises(NotFoundError, match=r"cannot be read: No such file or directory\.$"):
+        SealedFile(tmp_path / "none")

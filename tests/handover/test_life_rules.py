@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from teds_provision.errors import BadDataError, NotFoundError
+from teds_provision.errors import BadDataError, NotFoundError, NotWhitelistedError, PolicyError, UsageError
 from teds_provision.handover import life
 from teds_provision.handover.deny import deny, lift
 from teds_provision.handover.life import (
@@ -30,7 +31,7 @@ from teds_provision.provisioning.agree import ResetReceipt
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import Draft, KeyRecord, NodeRecord, WhitelistEntry
+from teds_provision.station.store.records import Draft, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
 from teds_provision.teds.image import Image
 from tests.bench import copied_station
 
@@ -184,6 +185,22 @@ def test_what_a_retired_node_leaves(station: Station) -> None:
 
 
 # -- replaced ----------------------------------------------------------------------------------------------------------
+
+
+def test_who_takes_no_place_and_whose_place_is_not_taken(station: Station) -> None:
+    plan = partial(plan_takeover, station, OLD, copy_calibration=False)
+    with pytest.raises(UsageError, match=r"^A node cannot replace itself\.$"):
+        plan(OLD)
+    with pytest.raises(NotFoundError, match=rf"^Node {OLD.hex()} is not known here\.$"):
+        plan(NEW)
+    station.nodes.put(NodeRecord(OLD, NODE.point))
+    with pytest.raises(NotWhitelistedError, match=NEW.hex()):
+        plan(NEW)
+    station.pins.put(WhitelistEntry(NEW))
+    assert not plan(NEW).done
+    station.policy.put_tombstone(Tombstone(OLD, PIN, "h", "2026-01-31T12:00:00Z"))
+    with pytest.raises(PolicyError, match="was moved to station"):
+        plan(NEW)
 
 
 def test_a_replaced_node_that_is_reset_later_is_confirmed(station: Station) -> None:

@@ -165,6 +165,8 @@ def test_a_move_taken_back_gives_its_own_nodes_back_to_be_rotated(station: Stati
     (kept,) = station.handovers.all()
     assert kept == replace(row, state="undone")
     assert keys(station) == [1, 1]
+    last = list(station.audit_log.entries())[-1]
+    assert (last.outcome, last.detail) == ("undone", {"handover": ID, "nodes": [A.hex(), B.hex()]})
     again = undo(station, kept)
     assert (again.fresh, len(told)) == (False, 2)
 
@@ -211,6 +213,20 @@ def test_the_receipt_of_a_move_deletes_the_keys_that_were_in_it_and_gives_back_w
     assert (row.state, row.receipt) == ("closed", octets.decode())
     again = close(station, octets)
     assert (again.fresh, again.row) == (False, row)
+
+
+def test_a_plan_of_a_receipt_is_what_is_done_then_and_changes_nothing(station: Station, told: Events) -> None:
+    row = left(station, notes=named())
+    octets, before = receipt(station, A, refused=(B,)), station.audit_log.newest()
+    plan = close(station, octets, dry_run=True)
+    assert (plan.fresh, plan.row.state) == (True, "closed")
+    assert (station.audit_log.newest(), station.handovers.all(), keys(station), told) == (before, [row], [1, 1], [])
+    assert close(station, octets) == plan
+    last = list(station.audit_log.entries())[-1]
+    counts = {"imported": 1, "refused": 1}
+    assert (last.act, last.outcome, last.detail) == (
+        "handover", "receipt", {"state": "closed", "from": TO_SOUTH, "handover": ID, **counts},
+    )  # fmt: skip
 
 
 def test_the_receipt_of_an_old_row_deletes_the_keys_that_there_were_when_the_bundle_left(station: Station) -> None:

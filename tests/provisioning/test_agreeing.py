@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,7 +40,7 @@ from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import KeyRecord, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import KeyRecord, RevocationRecord, TrustRecord, WhitelistEntry
 from tests.bench import Board, make_station, talk
 
 from .test_provision import run as provisioned
@@ -420,3 +420,42 @@ def test_epoch_and_sequence_of_a_bundle_are_replaced_by_those_of_the_session(
         assert log == [{"key_id": "ab" * 8, "said": 3, "epoch": 5}]
     else:
         assert (found.record, activated, known.epoch, known.sequence, log) == (record, [record], 3, 0, [])
+
+
+@pytest.mark.parametrize("with_person", [False, True])
+def test_a_node_of_another_owner_is_met_for_a_rotation_alone_and_a_revoked_one_never(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch, with_person: bool
+) -> None:
+    """Its CA may refuse the take-over, and then an entry of the whitelist would not help."""
+    given: list[dict[str, Any]] = []
+    questions: list[str] = []
+
+    def agreed(_station: object, node: object, who: object, **how: Any) -> AgreeResult:
+        assert (node, who) == ("node", "who")
+        given.append(how)
+        return DONE
+
+    visit: Any = SimpleNamespace(node="node", who="who")
+    monkeypatch.setattr(agreeing, "at_node", lambda *_, **__: nullcontext(visit))
+    monkeypatch.setattr(agreeing, "agree", agreed)
+
+    def at(*, rotate: bool) -> Any:
+        confirm = questions.append if with_person else None
+        return agree_at(station, LinkSettings(), board.uuid.hex(), SilentReporter(), rotate=rotate, confirm=confirm)
+
+    with pytest.raises(NotWhitelistedError):
+        at(rotate=False)
+    assert given == []
+    assert at(rotate=True).agreed is DONE
+    (how,) = given
+    take_over = how.pop("take_over")
+    assert how == {"rotate": True}
+    if with_person:
+        take_over("Take it over?", PolicyError("Another owner's."))
+    else:
+        assert take_over is None
+    assert questions == ["Take it over?"] * with_person
+    station.policy.deny(RevocationRecord(board.uuid, None, "lost", "{}"))
+    with pytest.raises(PolicyError, match="lost"):
+        at(rotate=True)
+    assert len(given) == 1

@@ -618,3 +618,17 @@ def test_the_environment_names_the_keyring_before_the_configuration_file(
     if named is not None:
         monkeypatch.setenv("PYTHON_KEYRING_BACKEND", named)
     assert keyring_vault._configured() == configured
+
+
+def test_an_entry_that_was_deleted_meanwhile_is_not_made_anew_by_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    name, backend = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}", MemoryKeyring()
+    monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
+    monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, backend)]))
+    vault = KeyringVault.create(STORE)
+    backend.entries.clear()
+    for change in (vault.add_master, vault.drop_ca, vault.retire_masters):
+        with pytest.raises(VaultError) as refused:
+            change()
+        assert refused.value.message == "The keyring no longer has an entry for this station."
+        assert refused.value.hint == keyring_vault._NO_ENTRY
+    assert backend.entries == {}
