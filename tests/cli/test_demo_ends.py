@@ -479,3 +479,28 @@ def test_the_story_rotates_the_key_over_the_bus(tmp_path: Path, monkeypatch: pyt
     assert (via, order.profile, order.name) == ("can", story.PROFILE, "crane slew angle")
     assert agreed == (("station", "node over can", "identity of node over can"), {"rotate": True})
     assert [(step.name, step.detail) for step in demo.steps.done] == [("rotate", "key epoch 2, key 0123")]
+
+
+def test_a_station_of_the_story_has_a_throwaway_passphrase_and_is_closed_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course: list[Any] = []
+    station = SimpleNamespace(fingerprint="ab" * 32, close=lambda: course.append("closed"))
+    asked: list[str] = []
+
+    def initialise(home: Path, *, ask: Any, **how: Any) -> Any:
+        course.append((home, how))
+        asked.extend((ask("new", True), ask("again", False)))
+        return station, None
+
+    monkeypatch.setattr(story, "initialise", initialise)
+    with ExitStack() as stack:
+        demo = demo_in(tmp_path, stack=stack)
+        found: Any = story.new_station(demo, "north")
+        assert found is station
+        made = {"name": "north", "keystore": "file", "costs": story.THROWAWAY}
+        assert course == [(tmp_path / "north", made)]
+    assert course[1:] == ["closed"]
+    assert asked[0] == asked[1]
+    assert len(asked[0]) == 32
+    assert [(step.name, step.detail) for step in demo.steps.done] == [("init", f"station north, key {'ab' * 8}")]

@@ -187,3 +187,12 @@ def test_every_room_extends_a_command_that_it_names_once(monkeypatch: pytest.Mon
     for command in (nodes, other, nodes):
         extending.extend(str(command.name), command)
     assert course == [("one", "a:f", nodes), ("three", "b:h", nodes)]
+
+
+def test_options_of_a_room_stand_behind_one_of_the_core_in_their_order() -> None:
+    given = [click.Option(["--a"]), click.Argument(["b"]), click.Option(["-c", "--long"])]
+    command = click.Command("x", params=[*given])
+    more = [click.Option(["--d"]), click.Option(["--e"])]
+    extending.add_options(command, "--a", *more)
+    assert command.params == [given[0], *more, given[1], given[2]]
+    assert extending.option_of(command, "--long") is given[2]

@@ -220,7 +220,26 @@ def test_no_page_installs_an_extra_from_an_index() -> None:
             'requirements = [{ name = "teds-provision", git = "https://example.org/it?rev=main" }]',
             "'teds-provision[ncap] @ git+https://example.org/it@main'",
         ),
+        (
+            'requirements = [{ name = "teds-provision", git = "https://example.org/it?tag=v1" }]',
+            "'teds-provision[ncap] @ git+https://example.org/it@v1'",
+        ),
+        (
+            'requirements = [{ name = "teds-provision", git = "https://example.org/it?branch=b" }]',
+            "'teds-provision[ncap] @ git+https://example.org/it@b'",
+        ),
+        (
+            'requirements = [{ name = "teds-provision", path = "/src/it.whl" }]',
+            "'teds-provision[ncap] @ /src/it.whl'",
+        ),
+        (
+            'requirements = [{ name = "pint" }, { name = "teds-provision", url = "https://example.org/it.whl" },'
+            ' { name = "paho-mqtt", extras = ["a", "b"], specifier = ">=2" }]',
+            "'teds-provision[ncap] @ https://example.org/it.whl' --with pint --with 'paho-mqtt[a,b]>=2'",
+        ),
         ("requirements = 3", "'teds-provision[ncap]'"),
+        ('python = "/usr/bin/python3"', "'teds-provision[ncap]'"),
+        ("python =", "'teds-provision[ncap]'"),
     ],
 )
 def test_a_tool_of_uv_is_installed_again_with_the_extra_and_all_that_it_has(
@@ -230,6 +249,17 @@ def test_a_tool_of_uv_is_installed_again_with_the_extra_and_all_that_it_has(
     (tmp_path / "uv-receipt.toml").write_text(f"[tool]\n{receipt}\nentrypoints = []\n")
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     assert how_to_install("ncap") == f"Install it: uv tool install {command}"
+
+
+def test_a_tool_of_uv_gets_other_packages_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    requirements = '[{ name = "teds-provision", extras = ["mqtt"] }, { name = "pint" }]'
+    (tmp_path / "uv-receipt.toml").write_text(f"[tool]\nrequirements = {requirements}\n")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    assert lazy.install_command("teds-provision[ble]", "numpy>=1.26", "rich") == (
+        "uv tool install 'teds-provision[ble,mqtt]' --with pint --with 'numpy>=1.26' --with rich"
+    )
+    (tmp_path / "uv-receipt.toml").write_text('[tool]\nrequirements = [{ name = "teds-provision" }]\n')
+    assert lazy.install_command("rich") == "uv tool install teds-provision --with rich"
 
 
 def test_what_the_demo_installs_is_enough_for_the_steps_that_readme_shows_after_it(tmp_path: Path) -> None:

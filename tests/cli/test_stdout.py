@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -276,3 +277,16 @@ def test_a_text_of_the_console_is_cleaned_and_keeps_its_colour() -> None:
     assert (bell.text, bell.control is None) == ("\a", False), "what rich itself steers"
     with pytest.raises(BrokenPipeError):
         console.on_broken_pipe()
+
+
+def test_output_that_is_lost_counts_as_written_and_a_broken_pipe_does_not() -> None:
+    with stdout.GuardedOutput("/dev/full", "w") as full:
+        assert full.failure == ""
+        assert full.write(memoryview(b"abcd").cast("H")) == 4, "octets, not elements"
+        assert full.failure == "No space left on device"
+    read, write = os.pipe()
+    os.close(read)
+    with stdout.GuardedOutput(write, "w") as broken:
+        with pytest.raises(BrokenPipeError):
+            broken.write(b"abcd")
+        assert broken.failure == ""

@@ -33,7 +33,7 @@ from teds_provision.errors import (
 from teds_provision.links.nfc import pcsc_readers
 from teds_provision.station.node_keys import deferred
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import StationRecord
+from teds_provision.station.store.records import NodeRecord, StationRecord, WhitelistEntry
 from teds_provision.station.store.row_sample import RowSample
 
 from ..bench import copy_home
@@ -1061,3 +1061,16 @@ def test_seals_that_are_broken_or_not_checked_have_their_remedy(
                           (StoreChangedError("Changed.", hint="Restore."), "failed")):  # fmt: skip
         monkeypatch.setattr(opened, "unlock", raising(error))
         assert one(fleet.seals(asked)) == Finding("seals", result, error.message, error.hint)  # type: ignore[arg-type]
+
+
+def test_a_store_is_summed_up_and_a_bus_that_was_not_asked_for_is_named(stationed: System, tmp_path: Path) -> None:
+    with Station.inspect(stationed.home) as store:
+        store.nodes.restore(NodeRecord(bytes(10)))
+        store.pins.restore([WhitelistEntry(bytes([number]) * 10, "ab" * 32) for number in range(2)])
+    assert words(stationed, "store")[0] == ("ok", "Intact; 1 node, 2 whitelisted.", "")
+    assert words(replace(stationed, home=tmp_path / "none"), "store") == [
+        ("skipped", "There is no station yet.", "teds-provision init")
+    ]
+    assert words(stationed, "can") == [
+        ("skipped", "No bus was given, so none was opened.", "teds-provision doctor --can socketcan:can0")
+    ]

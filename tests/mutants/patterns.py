@@ -2130,6 +2130,27 @@ PATTERNS = (
         "tests/protocol/operation/test_driving.py",
     ),
     Pattern(
+        "octets of lost output are counted as octets",
+        "GuardedOutput.write",
+        "memoryview(octets).nbytes",
+        "len(octets)",
+        "tests/cli/test_stdout.py",
+    ),
+    Pattern(
+        "options of a room stand behind the one that they are put after",
+        "add_options",
+        "command.params.index(option_of(command, after)) + 1",
+        "command.params.index(option_of(command, after))",
+        "tests/cli/test_help.py",
+    ),
+    Pattern(
+        "the tool itself is not installed beside itself",
+        "_uv_tool",
+        "['--with', needed] if not needed.startswith(_TOOL) else []",
+        "['--with', needed]",
+        "tests/cli/test_init.py",
+    ),
+    Pattern(
         "what is armed goes with the last claim alone",
         "StreamRole.claims_ended",
         "not self._claims.channels_of(session)",
