@@ -136,3 +136,18 @@ def test_values_count_on_only_by_the_datasheet_that_they_were_calibrated_by(
             "Values recorded of it since 2027-01-15T08:00:00Z do not count."
         )
     assert kept == [(image, "ncap", (b"\x8d" * 10, "proof"), 7)], "its verdict is that of the whole station"
+
+
+def test_the_pause_after_an_exchange_begins_when_it_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+
+    def steps() -> Iterator[None]:
+        now[0] += 0.5
+        yield
+
+    monkeypatch.setattr(background_reread, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    rest: Any = SimpleNamespace(
+        _due=0.0, _bus=SimpleNamespace(beginning=set()), _patient_until=0.0, _mine=True, _steps=steps()
+    )
+    assert BackgroundReread.step(rest) is True
+    assert rest._due == 100.5 + SPARING * 0.5

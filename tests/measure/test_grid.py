@@ -176,3 +176,28 @@ def test_every_row_is_the_definition(sizes: list[tuple[int, bool]], looks: list[
         else:
             assert abs(age - max(at - last, 0)) < 1e-7
             assert value == expected or (np.isnan(value) and np.isnan(expected))
+
+
+def test_an_empty_block_changes_nothing_and_an_older_one_makes_no_row_wait() -> None:
+    grid = Grid("g", [ANGLE], patience=10.0)
+    grid.add_block(block(np.zeros((0, 1))))
+    assert grid.rows(NOW) is None
+    grid.add_block(block([[1], [2], [3]]))
+    grid.add_block(block([[0]], start=NOW - 0.005))
+    assert len(rows(grid, NOW + 0.03).time) == 3
+
+
+def test_the_first_row_is_at_the_first_value_or_after_it_up_to_a_millionth_of_a_period() -> None:
+    for ahead, first in ((0.0, 0.0), (5e-7, 0.0), (0.25, 1.0), (0.75, 1.0)):
+        grid = Grid("g", [replace(ANGLE, period=1.0)], patience=0.0)
+        grid.add_block(block([[1], [2]], start=NOW + ahead, period=1.0))
+        got = rows(grid, NOW + 1.8)
+        assert (got.time[0] - NOW, bool(np.isnan(got.value[0, 0]))) == (first, False)
+
+
+def test_a_value_is_one_until_two_periods_are_over() -> None:
+    grid = Grid("g", [replace(ANGLE, period=0.5)], patience=0.0)
+    grid.add_block(block([[1]], start=100.0))
+    got = rows(grid, 101.6)
+    assert got.time.tolist() == [100.0, 100.5, 101.0, 101.5]
+    assert np.isnan(got.value[:, 0]).tolist() == [False, False, False, True]

@@ -15,7 +15,9 @@ from teds_provision.measure.verified_session import VerifiedSession, claim
 from teds_provision.protocol.messages.frames import Command, Function
 from teds_provision.protocol.operation.commands import ChannelState, OperationReply
 from teds_provision.provisioning.conversation import SessionLostError
+from teds_provision.teds.calibration import ChannelInterpreter
 from tests.measure.test_topic_actuators import SHEET
+from tests.teds.test_interpreter import sheet_of
 
 DEAD_MAN = 400
 Answer = Callable[[], None]
@@ -224,3 +226,10 @@ def test_a_unit_of_another_kind_is_refused_with_those_that_can_be_used() -> None
     assert " or m." in refusal.value.hint or refusal.value.hint == "Use m."
     assert chosen(1).unit.text == "m"
     assert chosen(1, "um").unit.to_si(5) == pytest.approx(5e-6)
+
+
+def test_an_actuator_whose_set_points_have_no_way_to_its_raw_values_is_refused() -> None:
+    node: Any = SimpleNamespace()
+    with pytest.raises(BadDataError) as refusal:
+        HeldActuator(VerifiedSession(node, sheet_of("gripper"), "00" * 32, "g"), 1)
+    assert refusal.value.message == ChannelInterpreter(sheet_of("gripper"), 1).problem != ""

@@ -8,10 +8,12 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from teds_provision.links.can.airtime import CanAirtime
+from teds_provision.measure import rates
 from teds_provision.measure.planning import BusTime
 from teds_provision.measure.rates import (
     RateProposal,
@@ -24,9 +26,11 @@ from teds_provision.measure.rates import (
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.station.station import Station
+from teds_provision.teds.channel import Channel
 from tests.bench import make_station
 from tests.e2e.desk import ANGLE
 from tests.measure.rig import FAULTY, Rig, provisioned
+from tests.measure.test_planning import channels
 
 HIGH = 1e9
 
@@ -52,8 +56,8 @@ def proposed(station: tuple[Station, bytes, bytes], around: Surroundings, *which
 
 
 def test_rates_are_rounded_down_and_a_loss_leaves_room() -> None:
-    rates = [10_000, 9_999, 3_846, 2_000, 1_999, 100, 99.9, 7, 0.35, 0.01]
-    assert [rounded_down(rate) for rate in rates] == [10_000, 5_000, 2_000, 2_000, 1_000, 100, 50, 5, 0.2, 0.1]
+    exact = [10_000, 9_999, 3_846, 2_000, 1_999, 100, 99.9, 7, 0.35, 0.01]
+    assert [rounded_down(rate) for rate in exact] == [10_000, 5_000, 2_000, 2_000, 1_000, 100, 50, 5, 0.2, 0.1]
     assert lower_rate(10_000, messages=900, lost=100) == 5_000
     assert lower_rate(100, messages=1, lost=99) == 0.5
     assert lower_rate(100, messages=0, lost=9) == 0.1
@@ -126,13 +130,13 @@ def test_only_requested_sensors_that_have_a_rate_count(station: tuple[Station, b
     """The gripper: an actuator (1) and two sensors of 100 Hz (2 and 3)."""
     hand = [station[2]]
 
-    def machine(values: float, *channels: int) -> RateProposal | None:
-        return propose(station[0], hand, MeasurementRequest(channels=channels), Surroundings(values=values))
+    def machine(values: float, *numbers: int) -> RateProposal | None:
+        return propose(station[0], hand, MeasurementRequest(channels=numbers), Surroundings(values=values))
 
-    for channels, values in (((), 200.0), ((2,), 100.0), ((2, 3), 200.0), ((1, 2), 100.0)):
-        whole = machine(values, *channels)
-        assert whole == RateProposal(100.0, 100.0, "datasheet", ""), channels
-        less = machine(values - 0.5, *channels)
+    for numbers, values in (((), 200.0), ((2,), 100.0), ((2, 3), 200.0), ((1, 2), 100.0)):
+        whole = machine(values, *numbers)
+        assert whole == RateProposal(100.0, 100.0, "datasheet", ""), numbers
+        less = machine(values - 0.5, *numbers)
         assert less is not None
         assert (less.limit, less.rate, less.why) == (
             "machine",
@@ -179,3 +183,19 @@ def test_a_run_that_lost_values_gives_the_command_for_a_lower_rate(tmp_path: Pat
         ), human
     finally:
         rig.close()
+
+
+def test_a_slower_channel_keeps_its_rate_and_the_fastest_one_of_a_node_makes_its_rows() -> None:
+    """One channel of 100 Hz and one of 10 Hz, asked for at 1 kHz; each bus, and each limit, in its turn."""
+    sensors = {bytes(10): channels(0.01, 0.1)}
+
+    def limit(sensors: dict[bytes, list[Channel]] = sensors, **around: Any) -> str | None:
+        return rates._limit(sensors, 1000.0, Surroundings(**{"values": HIGH, **around}))
+
+    assert (limit(values=110.0), limit(values=109.9)) == (None, "machine")
+    assert (limit(budget=220.0, rows=True), limit(budget=219.9, rows=True)) == (None, "budget")
+    full = BusTime(CanAirtime(1_000_000), taken=MOST_LOAD)
+    two = {bytes([number]) * 10: channels(0.01) for number in (0, 1)}
+    for on_it in (0, 1):
+        assert limit(two, bus=lambda uuid, on_it=on_it: ("can0", full) if uuid[0] == on_it else None) == "bus"
+    assert limit(two) is None

@@ -491,26 +491,34 @@ class _Steps:
 
 
 @pytest.mark.parametrize(
-    ("moved", "dry_run", "asked"),
-    [(0.5, False, "brought"), (-0.5, False, "brought"), (-0.5, True, "planned"), (0.01, False, ""), (-0.01, False, "")],
-)
+    ("moved", "dry_run", "tapped", "asked"),
+    [
+        (0.5, False, False, "brought"), (-0.5, False, False, "brought"), (0.5, False, True, "brought"),
+        (-0.5, True, False, "planned"), (0.01, False, False, ""), (-0.01, False, False, ""),
+    ],
+)  # fmt: skip
 def test_a_zero_offset_is_written_if_it_moves_either_way_by_more_than_the_doubt(
-    monkeypatch: pytest.MonkeyPatch, moved: float, dry_run: bool, asked: str
+    monkeypatch: pytest.MonkeyPatch, moved: float, dry_run: bool, tapped: bool, asked: str
 ) -> None:
-    """A dry run records nothing at the guard of calibrations, and writes nothing."""
+    """A dry run records nothing at the guard of calibrations, and writes nothing. Results are in SI units."""
     guarded: list[dict[str, Any]] = []
+    checked, shown, dated = list[str](), list[Any](), list[Any]()
 
     def guard(*_: Any, **more: Any) -> tuple[str, ...]:
         guarded.append(more)
-        return ()
+        return ("guarded",)
 
-    unit = SimpleNamespace(scale=1.0, difference_to_si=lambda value: value)
+    unit = SimpleNamespace(scale=2.0, difference_to_si=lambda value: value * 2)
     own = SimpleNamespace(zero_offset=2.0, unit=unit)
     channel = SimpleNamespace(
-        number=1, full_turn=False, show_reading=lambda *_: "", show=lambda *_, **__: "", si_unit="rad"
+        number=1,
+        full_turn=False,
+        show_reading=lambda *_: "",
+        show=lambda *_, **how: shown.append(how),
+        si_unit="rad",
     )
     image = SimpleNamespace(blocks={(1, 5): b"curve"}, unsigned_blocks=dict)
-    reading = SimpleNamespace(mean=1.0, count=32, spread=0.0, doubt=0.02)
+    reading = SimpleNamespace(mean=1.0, count=32, spread=0.125, doubt=0.02)
     for name, made in {
         "require_session": lambda *_: None,
         "verify_in_session": lambda *_, **__: SimpleNamespace(image=image),
@@ -521,25 +529,34 @@ def test_a_zero_offset_is_written_if_it_moves_either_way_by_more_than_the_doubt(
         "require_still": lambda _settled: reading,
         "offset_for": lambda *_: 2.0 + moved,
         "shortest": lambda given, _turn: given,
-        "_si": lambda _channel, _own, value: value,
-        "with_zero_offset": lambda *_: b"new",
+        "_si": lambda _channel, _own, value: value * 2,
+        "with_zero_offset": lambda *words: dated.append(words) or b"new",
         "guard": guard,
         "diff_blocks": lambda *_: (),
-        "require_not_measured": lambda *_, **__: None,
-        "_require_nobody_else": lambda *_: None,
+        "require_not_measured": lambda *_, **__: checked.append("here"),
+        "_require_nobody_else": lambda *_: checked.append("elsewhere"),
     }.items():
         monkeypatch.setattr(zero, name, made)
-    node = SimpleNamespace(uuid=UUID, proven=SimpleNamespace(sequence=7, epoch=1), tapped=False)
+    node = SimpleNamespace(uuid=UUID, proven=SimpleNamespace(sequence=7, epoch=1), tapped=tapped)
     run: Any = SimpleNamespace(
         visit=SimpleNamespace(station=None, node=node, released=None), steps=_Steps(), dry_run=dry_run,
-        order=SimpleNamespace(channel=1, accept_calibration=None), _wanted=lambda *_: 0.0, _warnings=lambda *_: (),
+        order=SimpleNamespace(channel=1, accept_calibration=None), _wanted=lambda *_: 0.0,
+        _warnings=lambda *_: ("beyond",),
         _bring=lambda _image, found: ("brought", found),
     )  # fmt: skip
     found: Any = zero._ZeroRun.run(run)
     how, result = found if isinstance(found, tuple) else ("", found)
     assert how == ("brought" if asked == "brought" else "")
-    assert [more["record"] for more in guarded] == {"brought": [True], "planned": [False], "": []}[asked]
-    assert (result.offset, result.moved) == ((2.0 + moved, pytest.approx(moved)) if asked else (2.0, 0.0))
+    record = {"brought": [True], "planned": [False], "": []}[asked]
+    assert guarded == [{"record": recorded, "expected": ("changed",)} for recorded in record]
+    assert (result.offset, result.moved) == ((4.0 + 2 * moved, pytest.approx(2 * moved)) if asked else (4.0, 0.0))
+    assert (result.before, result.after, result.spread) == (2.0, pytest.approx(2.0 + 2 * moved), 0.25)
+    assert result.warnings == (("beyond", "guarded") if asked else ("beyond",))
+    assert [(octets, offset, at.microsecond) for octets, offset, at in dated] == [(b"curve", 2.0 + moved, 0)] * bool(
+        asked
+    )
+    assert shown == [{"difference": True}] * bool(asked)
+    assert checked == (["here", "elsewhere"] if asked == "brought" and not tapped else []), "a tap ends other claims"
     assert run.steps.done == (["read", "build"] if asked else ["read"])
 
 

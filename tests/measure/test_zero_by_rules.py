@@ -165,6 +165,7 @@ def test_a_reading_beyond_its_curve_and_a_draft_are_warned_of() -> None:
         (-40.51, "degC", 233.15, 400.0, 0.5, "-40.51 degC"),
         (126.86, "degC", 233.15, 400.0, math.nan, "126.86 degC"),
         (126.86, "degC", 233.15, 400.0, -3.0, "126.86 degC"),
+        (126.84, "degC", 233.15, 400.0, -3.0, 126.84),
         (500.0, None, 233.15, 400.0, 0.5, "226.85 °C"),
         (500.0, "degC", math.nan, math.nan, 0.5, 500.0),
     ],
@@ -226,8 +227,8 @@ def test_a_session_that_is_lost_meanwhile_is_reported_by_its_cause_and_nothing_i
     held: list[Any] = []
 
     @contextmanager
-    def own(_station: Any, _links: Any, command: str, *, shared: bool) -> Any:
-        held.append((command, shared))
+    def own(_station: Any, links: Any, command: str, *, shared: bool) -> Any:
+        held.append((links, command, shared))
         yield "own"
 
     @contextmanager
@@ -258,7 +259,7 @@ def test_a_session_that_is_lost_meanwhile_is_reported_by_its_cause_and_nothing_i
         call()
     assert failed.value is cause
     assert held == [
-        (f"calibrate {does} {UUID.hex()}", False),
+        ("links", f"calibrate {does} {UUID.hex()}", False),
         ("own", UUID, {} if does == "capture" else {"unlock": "always", "writes": "calibrate zero"}),
     ]
     assert required == ([] if does == "capture" else [UUID])
@@ -271,3 +272,16 @@ def test_a_session_that_is_lost_meanwhile_is_reported_by_its_cause_and_nothing_i
     else:
         with pytest.raises(NotFoundError, match=r"^There is no folder .*none\.$"):
             capture.capture_at(station, links, "finger", 1, 5.0, tmp_path / "none" / "c.csv", reporter)
+
+
+@pytest.mark.parametrize(
+    ("values", "possible"),
+    [([1.0, 2.0], [True, False]), ([1.0, math.inf], [True, True]), ([math.nan, 1.0], [True, True])],
+)
+def test_one_raw_value_that_cannot_be_spoils_a_series(values: list[float], possible: list[bool]) -> None:
+    interpreter: Any = SimpleNamespace(
+        calibrated=lambda _raw, _others: (np.array(values), np.array(possible), None),
+        channel=SimpleNamespace(number=7),
+    )
+    with pytest.raises(PolicyError, match=r"^Channel 7 delivers raw values that its type does not allow\.$"):
+        SampleSeries(interpreter, np.array([1, 2], dtype=np.uint64), {}).calibrated()

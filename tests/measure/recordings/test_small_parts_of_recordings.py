@@ -19,6 +19,7 @@ from teds_provision.errors import BadDataError
 from teds_provision.measure.blocks import Block, GroupRows, NodeReport, Note, StationFacts
 from teds_provision.measure.display_units import UnitConversion, in_display_units, in_si_units
 from teds_provision.measure.recordings import columns, converting, source, text
+from teds_provision.measure.recordings import summary as of_summary
 from teds_provision.measure.recordings.columns import part_of
 from teds_provision.measure.recordings.mcap import McapRecording
 from teds_provision.measure.recordings.opening import open_recording
@@ -348,3 +349,13 @@ def test_counts_that_began_anew_in_this_file_are_not_negative() -> None:
     last = NodeReport(ARM, "ended", samples=130, lost=1, late=6, bad=0, invalid=2)
     found = summary._of_this_file(last)
     assert (found.samples, found.lost, found.late, found.bad, found.invalid) == (30, 0, 2, 0, 0)
+
+
+def test_of_a_recording_no_more_nodes_and_channels_are_counted_than_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(of_summary, "MOST", replace(source.MOST, channels=2))
+    summary = RecordingSummary()
+    summary.add_entry(tuple(replace(ANGLE, number=number) for number in (1, 2, 3)))
+    for uuid in (ARM, HAND, "ff" * 10):
+        summary.add_entry(NodeReport(uuid, "running"))
+    assert list(summary.facts) == [(ARM, 1), (ARM, 2)]
+    assert list(summary.reports) == [ARM, HAND]

@@ -1115,3 +1115,11 @@ def test_of_a_block_its_last_instant_is_published_with_its_time() -> None:
         ("/bench/arm/angle", float(given.time[2]), pytest.approx(0.3), 0.5)
     ]
     assert made._newest == {(ARM, 1): pytest.approx(0.3)}
+
+
+def test_a_node_with_another_name_gives_its_channels_the_names_that_are_free_there() -> None:
+    topics = Topics(replace(STATION, names={(HAND, 2): "bench/arm/angle"}))
+    topics.learn([ANGLE, FORCE])
+    assert topics.channel(ARM, 1) == "/bench/arm/angle_1"
+    topics.learn([replace(ANGLE, uuid="f" * 20)])
+    assert topics.channel(ARM, 1) == f"/bench/arm_{ARM}/angle"

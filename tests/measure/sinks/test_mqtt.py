@@ -768,3 +768,26 @@ def test_why_there_is_no_connection_is_said_in_words(error: Any, words: str, mon
     sink._count(dropped=1)
     sink._finish()
     assert sink.stats.error == f"mqtt://lab:7 accepted nothing: {words}."
+
+
+@pytest.mark.parametrize(("rc", "again"), [(15, True), (4, False)])
+def test_an_entity_that_the_library_did_not_take_is_announced_again_and_one_that_it_keeps_is_not(
+    rc: int, again: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """15: its queue is full; 4: the connection was lost, and it keeps what has a receipt until there is one."""
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    connected(sink)
+    sink._idle(0.0)
+    library.of("publish")
+    library.rc = rc
+    sink._process_item((OIL,))
+    assert [words[0] for words, _ in library.of("publish")] == [f"homeassistant/sensor/{HAND}/3/config"]
+    library.rc = 0
+    sink._idle(0.0)
+    assert len(library.of("publish")) == again
+
+
+def test_a_channel_without_an_entity_keeps_no_other_one_waiting() -> None:
+    sink, client = desk_sink(replace(ANGLE, unsigned=True), FORCE)
+    sink._announce()
+    assert [topic for topic, _ in client.published] == [f"homeassistant/sensor/{HAND}/2/config"]
