@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from teds_provision.errors import (
+    AddressConflictError,
     BadDataError,
     LinkError,
     NoRoomError,
@@ -24,6 +25,8 @@ from teds_provision.errors import (
 )
 from teds_provision.measure import capture, matching, node_supervisor, standing, verified_session, zero
 from teds_provision.measure import clock as of_clock
+from teds_provision.measure import interpreter as of_interpreter
+from teds_provision.measure import presence as of_presence
 from teds_provision.measure.blocks import SetPointCommand, StationFacts
 from teds_provision.measure.clock import SLEW, ClockMap, HostClock, WallClock
 from teds_provision.measure.interpreter import StreamInterpreter
@@ -679,3 +682,26 @@ def test_a_newcomer_for_which_the_bus_has_no_room_waits(monkeypatch: pytest.Monk
     monkeypatch.setattr(made, "_is_shared", lambda _error: None)
     made._run()
     assert [(report.state, report.why) for report in reports] == [("waiting", "no room on the bus")]
+
+
+def test_a_conflict_of_addresses_is_raised_as_a_new_error_with_its_hint_until_it_is_old(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Several threads raise it, and each adds its own traceback."""
+    now, place, made = [0.0], ("can", 7), Presence()
+    monkeypatch.setattr(of_presence, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    error = AddressConflictError("Two nodes answer.", hint="Readdress one.")
+    made._conflicts[place] = (0.0, error)  # type: ignore[index]
+    found: Any = made._conflict_at(place)  # type: ignore[arg-type]
+    assert (found is not error, found.message, found.hint) == (True, "Two nodes answer.", "Readdress one.")
+    now[0] = of_presence.RECENT
+    assert made._conflict_at(place) is None  # type: ignore[arg-type]
+
+
+def test_of_the_channels_that_a_compensation_lacks_the_first_is_named() -> None:
+    interpreter: Any = SimpleNamespace(problem="", others=(4, 5, 6), channel=SimpleNamespace(number=1))
+    for present, named in (({1}, 4), ({1, 4}, 5), ({1, 4, 5}, 6)):
+        assert of_interpreter._why_raw(interpreter, present) == (
+            f"Channel 1 is compensated by channel {named}, which is not part of the same stream."
+        )
+    assert of_interpreter._why_raw(interpreter, {1, 4, 5, 6}) == ""
