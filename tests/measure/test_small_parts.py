@@ -705,3 +705,16 @@ def test_of_the_channels_that_a_compensation_lacks_the_first_is_named() -> None:
             f"Channel 1 is compensated by channel {named}, which is not part of the same stream."
         )
     assert of_interpreter._why_raw(interpreter, {1, 4, 5, 6}) == ""
+
+
+def test_a_ban_is_looked_up_with_the_key_that_is_pinned_of_the_node() -> None:
+    asked: list[Any] = []
+    station: Any = SimpleNamespace(
+        pins=SimpleNamespace(pinned=lambda uuid: ("pin of", uuid)),
+        policy=SimpleNamespace(denied=lambda *words: asked.append(words) or SimpleNamespace(why="stolen")),
+    )
+    with pytest.raises(NotAuthenticError) as refused:
+        standing.require_measurable(station, UUID)
+    assert asked == [(UUID, ("pin of", UUID))]
+    assert refused.value.message == f"Node {UUID.hex()} was revoked: stolen."
+    assert refused.value.hint == f"If that was a mistake: teds-provision revoke --lift {UUID.hex()}"

@@ -17,7 +17,7 @@ import pytest
 
 from teds_provision.errors import BadDataError, StoreError, UsageError
 from teds_provision.measure import sinks
-from teds_provision.measure.blocks import ChannelFacts, NodeReport, StationFacts
+from teds_provision.measure.blocks import ChannelFacts, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks import files, in_units, json_events, names, open_sink, vectors, without_scalars
 from teds_provision.measure.sinks.base import ThreadedSink
 from teds_provision.measure.sinks.files import Part
@@ -595,3 +595,10 @@ def test_a_chunk_is_closed_when_it_is_full_or_old_and_its_age_counts_from_its_fi
 def test_a_deviation_of_0_is_none_and_the_uncertainty_counts() -> None:
     facts = ChannelFacts(ARM, "arm", 1, "angle", "sensor", uncertainty=0.3, deviation=0.0)
     assert vectors.variance_of(facts) == pytest.approx(0.03)
+
+
+def test_only_a_finite_value_of_a_row_is_valid() -> None:
+    values = [1.0, float("inf"), float("nan")]
+    rows = GroupRows("all", ((ARM, 1),), np.array([1.0, 2.0, 3.0]), np.array([values]).T, np.zeros((3, 1)))
+    (line,) = json_events.row_lines(rows, {})
+    assert (line["valid"], line["value"]) == ([True, False, False], [1.0, None, None])
