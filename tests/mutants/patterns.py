@@ -2614,6 +2614,27 @@ PATTERNS = (
     ),
     # the node
     Pattern(
+        "every node of a run wraps a sensor of its kind",
+        "require_match",
+        "zip(origins, names, strict=True)",
+        "zip(origins[:1], names[:1], strict=True)",
+        "tests/node/test_wrapped_devices.py",
+    ),
+    Pattern(
+        "a device is called by its name before its label",
+        "find",
+        "_text(folder / 'name') or _text(folder / 'label') or folder.name",
+        "_text(folder / 'label') or _text(folder / 'name') or folder.name",
+        "tests/node/test_wrapped_devices.py",
+    ),
+    Pattern(
+        "a Type 4 tag takes an FSDI above 8 as 8",
+        "IsoDepTag.__init__",
+        "min(rats[1] >> 4 if len(rats) > 1 else 0, 8)",
+        "min(rats[1] >> 4 if len(rats) > 1 else 0, 7)",
+        "tests/node/test_emulated_tags.py",
+    ),
+    Pattern(
         "an address is known once to every node of its bus",
         "EndpointTable.record_use",
         "1 <= source <= LAST_NODE and source not in self._known",

@@ -128,6 +128,23 @@ def test_no_block_upsets_a_type_4_tag(blocks_sent: list[bytes], rats: bytes) -> 
         assert got is None or 0 < len(got) <= 254
 
 
+@pytest.mark.parametrize(
+    ("rats", "octets"),
+    [("e0", 13), ("e000", 13), ("e01f", 21), ("e020", 29), ("e030", 37), ("e040", 45), ("e050", 61), ("e060", 93),
+     ("e070", 125), ("e080", 253), ("e090", 253), ("e0f0", 253)],
+)  # fmt: skip
+def test_a_block_is_as_long_as_the_reader_takes_it(rats: str, octets: int) -> None:
+    """ISO/IEC 14443-4, FSDI: 16 to 256 octets, of which one is the PCB and two are the CRC."""
+    memory = Type4Memory(400)
+    memory.put(bytes(300))
+    tag = IsoDepTag(bytes.fromhex(rats), NdefApplication(memory, lambda seconds: True))
+    for number, apdu in enumerate((SELECT_APPLICATION, SELECT_NDEF)):
+        assert tag.answer(bytes((0x02 | number,)) + apdu) == bytes((0x02 | number,)) + b"\x90\x00"
+    block = tag.answer(bytes.fromhex("0200B00000FF"))
+    assert block is not None
+    assert (block[0] & 0x10, len(block) - 1) == (0x10, octets)
+
+
 def test_a_type_2_tag_has_the_layout_of_the_nhs31xx() -> None:
     memory = Type2Memory(UID)
     memory.put(b"hello")

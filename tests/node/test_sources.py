@@ -147,6 +147,7 @@ def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) ->
         ("t,angle\n\n#\n,1\n", "line 4"),
         ("t,angle\n0,1\n2,1\n1,1\n", "line 4: times must be ascending"),
         ("t,angle\n0,1,2\n", "line 2: 3 fields, the first line names 2"),
+        ("# of a bench\n\nt,angle\n0,1\n\n# late\n1\n", "line 7: 1 fields, the first line names 2"),
         ("t,angle,\n0,1,2\n", "no sensor named ''"),
         ('t,angle\n0,"1\n"\n', "quotation mark"),
         (f"t,angle\n0,{'1' * 131_073}\n", "is not CSV"),

@@ -34,6 +34,7 @@ from teds_provision.node.wrapped.latest_values import LatestValues
 from teds_provision.node.wrapped.reading import describe
 from teds_provision.node.wrapped.running import SensorPlace, WrappedRun, require_match
 from teds_provision.teds.image import Image
+from teds_provision.teds.origin import Origin
 from teds_provision.teds.sheet import Sheet
 from tests.e2e.desk import ROOT
 from tests.pace import until
@@ -194,6 +195,20 @@ def test_options_of_a_canopen_run(bus: str) -> None:
             require_match(SensorPlace(f"canopen:{EDS}", bus, node_ids), [origin, origin], ["a", "b"])
 
 
+@pytest.mark.parametrize(
+    ("second", "why"),
+    [
+        (None, "Node b wraps no sensor."),
+        (Origin("iio", "adc"), "Node b wraps a sensor of kind iio, which --source canopen does not read."),
+    ],
+)
+def test_every_node_of_a_run_wraps_a_sensor_of_its_kind(second: Origin | None, why: str) -> None:
+    place = SensorPlace(f"canopen:{EDS}", "socketcan:can0", (5, 6))
+    with pytest.raises(UsageError) as no:
+        require_match(place, [describe(f"eds:{EDS}").origin, second], ["a", "b"])
+    assert no.value.message == why
+
+
 @given(st.binary(max_size=300), st.integers(0, 60))
 def test_an_eds_ends_in_a_description_or_in_an_error_of_ours(
     tmp_path_factory: pytest.TempPathFactory, octets: bytes, share: int
@@ -284,6 +299,18 @@ def test_iio_facts_of_a_channel_go_before_those_of_its_type(sysfs: Callable[...,
     assert found["temp"].note == why
     assert found["smell"].note == f"the type smell has no unit here: values are plain numbers; {why}"
     assert found["smell"].unit == "count"
+
+
+@pytest.mark.parametrize(
+    ("files", "title"),
+    [({"name": "adc", "label": "desk"}, "adc"), ({"label": "desk"}, "desk"), ({}, "iio:device3")],
+)
+def test_a_device_is_called_by_its_name_then_its_label_then_its_folder(
+    sysfs: Callable[..., Path], tmp_path: Path, files: dict[str, str], title: str
+) -> None:
+    folder = sysfs("iio:device3", in_voltage0_raw="1", **files)
+    found = iio_device.find(f"{folder}?root={tmp_path}")
+    assert (found.name, found.character) == (title, tmp_path / "dev" / "iio:device3")
 
 
 @pytest.mark.parametrize(

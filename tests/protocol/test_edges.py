@@ -33,9 +33,9 @@ from teds_provision.protocol.keys import (
 )
 from teds_provision.protocol.messages import smp
 from teds_provision.protocol.messages.arguments import _octets, read_plain, write_plain
-from teds_provision.protocol.messages.frames import Command
+from teds_provision.protocol.messages.frames import Command, Reply
 from teds_provision.protocol.messages.message import compose_command, compose_service
-from teds_provision.protocol.messages.tables import describe_request
+from teds_provision.protocol.messages.tables import describe_answer, describe_request
 from teds_provision.protocol.operation.can_frames import StreamAssembly
 from teds_provision.protocol.operation.datagram import DatagramSealer
 from teds_provision.protocol.plant.document import Fields
@@ -390,10 +390,33 @@ def test_a_der_signature_is_of_a_point_over_a_message_or_no_good() -> None:
         (Command(0, 1, 1, b"\x10\0\0\0\7"), "Query (1.1), 5 octets: TEDS 16 of channel 0"),
         (Command(0, 1, 2, b""), "Read (1.2), 0 octets"),
         (Command(0, 128, 8, bytes(31)), "Prove (128.8), 31 octets"),
+        (Command(1, 1, 5, b"\1"), "Run self-test (1.5), 1 octets"),
+        (Command(1, 4, 1, bytes(17)), "TransducerChannel Operate (4.1), 17 octets"),
+        (Command(1, 3, 2, bytes(6)), "Write data-set segment (3.2), 6 octets"),
+        (Command(0, 1, 99), "1.99, 0 octets"),
+        (Command(0, 128, 10, b"\x21"), "Set can address (128.10), 1 octets"),
+        (Command(0, 128, 99), "128.99, 0 octets"),
+        (Command(0, 200, 8, bytes(3)), "200.8, 3 octets"),
     ],
 )
 def test_a_command_of_teds_is_described_with_its_teds_and_its_place(command: Command, words: str) -> None:
     assert describe_request(command) == words
+
+
+@pytest.mark.parametrize(
+    ("reply", "words"),
+    [
+        (Reply(True, bytes(64)), "success, 64 octets"),
+        (Reply(True), "success, 0 octets"),
+        (Reply(False, b"\x11"), "refusal 17 (busy)"),
+        (Reply(False, b"\x12"), "refusal 18 (no such teds)"),
+        (Reply(False, b"\xc8"), "refusal 200"),
+        (Reply(False, b"\xc8\0"), "a refusal of 2 octets"),
+        (Reply(False), "a refusal of 0 octets"),
+    ],
+)
+def test_an_answer_is_described_with_its_command(reply: Reply, words: str) -> None:
+    assert describe_answer(Command(0, 128, 8, bytes(31)), reply) == f"reply to Prove (128.8): {words}"
 
 
 def test_what_was_begun_of_a_message_is_dropped_with_its_link() -> None:
