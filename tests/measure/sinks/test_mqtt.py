@@ -196,9 +196,15 @@ class TestWithMosquitto:
             until(lambda: sink.stats.detail == f"nothing is listening at 127.0.0.1:{broker.port}")
             sink.write(block())
             until(lambda: sink.stats.dropped == 1)
-            for _ in range(2):
+            sink.report(NodeReport(ARM, "running"))
+            for _ in range(2):  # each is another process: what the first one retained is lost
                 broker.start()
                 until(lambda: sink.stats.state == "running")
+                client, heard = broker.heard()
+                until(lambda: "bench/arm/state" in heard)  # noqa: B023  asked before the next round
+                client.disconnect()
+                client.loop_stop()
+                assert json.loads(heard["bench/arm/state"])["state"] == "running"
                 broker.stop()
                 until(lambda: sink.stats.state == "waiting")
         finally:
