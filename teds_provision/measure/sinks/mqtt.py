@@ -97,7 +97,7 @@ class MqttSink(ThreadedSink):
         """The name of each node in topics, as it was announced last."""
         self._owed_entities: dict[tuple[str, int], None] = {}  # entities to announce, in this order
         self._reports: dict[str, NodeReport] = {}
-        """The newest report of each node; the broker gets it anew after each connection and under each new name."""
+        """The newest report of each node that is measured; it is published again after each connection and renaming."""
         self._owed_states: dict[str, None] = {}  # nodes whose report the broker does not have, in this order
         self._left: list[str] = []  # topics of former names, whose retained states must be removed
         self._newest: dict[str, dict[str, float | None]] = {}
@@ -240,7 +240,7 @@ class MqttSink(ThreadedSink):
             self._why = ""
             self._set_state("running", f"connected to {self._host}")
             self._owed_entities = dict.fromkeys(self._facts)
-            self._owed_states = dict.fromkeys(self._reports)
+            self._owed_states |= dict.fromkeys(self._reports)
             self._announce()
 
     def _announce(self) -> None:
@@ -248,12 +248,17 @@ class MqttSink(ThreadedSink):
         if not self._connected.is_set() or self._anew.is_set():
             return
         while self._left:
-            self._client.publish(f"{self._topics.station}/{self._left.pop()}/state", b"", retain=True)
+            if self._client.publish(f"{self._topics.station}/{self._left[-1]}/state", b"", retain=True).rc != 0:
+                return
+            self._left.pop()
         while self._owed_states:
             uuid = next(iter(self._owed_states))
-            if not self._publish(self._state_topic(uuid), status_line(self._reports[uuid]), retain=True):
+            report = self._reports[uuid]
+            if not self._publish(self._state_topic(uuid), status_line(report), retain=True):
                 return
             del self._owed_states[uuid]
+            if report.state == "ended":  # another measurement may have the node by the next connection
+                del self._reports[uuid]
         while self._owed_entities:
             key = next(iter(self._owed_entities))
             if not self._discover(self._facts[key]):

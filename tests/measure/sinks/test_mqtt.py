@@ -677,6 +677,31 @@ def test_each_connection_publishes_the_newest_state_of_every_node(monkeypatch: p
     assert (words[0], json.loads(words[1])["state"]) == (state, "lost")
 
 
+def test_the_end_of_a_node_is_published_once_and_not_after_later_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By then another measurement may have the node, whose state is running."""
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    for state in ("running", "ended"):
+        sink._process_item(NodeReport(ARM, state))  # type: ignore[arg-type]
+    for published in (["ended"], []):
+        connected(sink)
+        sink._idle(0.0)
+        sent = [words for words, _ in library.of("publish") if words[0] == "bench/arm/state"]
+        assert [json.loads(words[1])["state"] for words in sent] == published
+
+
+def test_a_former_topic_is_cleared_once_the_library_takes_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, library = with_library(monkeypatch, "mqtt://lab", ANGLE)
+    connected(sink)
+    sink._process_item(NodeReport(ARM, "running"))
+    library.of("publish")
+    library.rc = 4  # the connection was lost, and nobody has noticed yet
+    sink._process_item((replace(ANGLE, chosen=((0, "left"),)),))
+    library.of("publish")
+    library.rc = 0
+    sink._idle(0.0)
+    assert next(words[:2] for words, _ in library.of("publish")) == ("bench/arm/state", b"")
+
+
 def test_a_node_with_a_new_name_keeps_its_state_under_it() -> None:
     sink, client = desk_sink(ANGLE, FORCE)
     sink._announce()
